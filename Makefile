@@ -1,0 +1,46 @@
+# Two commands do everything from a bare clone: `make train` and `make test`. The rest are conveniences.
+PYTHON ?= python3
+# One virtual environment a Python version, so that PYTHON=... never mixes two.
+VENV := .venv-$(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+PY := $(VENV)/bin/python
+CONFIG ?= tiny
+RUN ?= runs/$(CONFIG)
+
+.PHONY: help train test test-slow bench lint format lock clean
+
+help:  ## show this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+
+$(VENV)/.synced: requirements.lock
+	@test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	@test -x $(VENV)/bin/uv || $(PY) -m pip install --quiet --disable-pip-version-check uv
+	@echo "installing the locked packages into $(VENV)"
+	@$(VENV)/bin/uv pip sync --quiet --python $(PY) requirements.lock
+	@$(PY) -m pip --version >/dev/null
+	@$(VENV)/bin/uv --version >/dev/null 2>&1 || $(PY) -m pip install --quiet --disable-pip-version-check uv
+	@touch $@
+
+setup: $(VENV)/.synced  ## make the virtual environment
+
+train: setup  ## demonstrations, training, closed-loop evaluation and report for CONFIG (default: tiny)
+	$(PY) train.py $(CONFIG) --run $(RUN) --resume
+	$(PY) eval.py $(RUN) --skip-finished
+	@echo "report: $(RUN)/eval/report.html"
+
+test: setup  ## the test suite
+	$(PY) -m pytest
+
+test-slow: setup  ## the long tests too
+	$(PY) -m pytest -m "slow or not slow"
+
+lint: setup  ## ruff and pyright
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright
+
+format: setup  ## format the code
+	$(PY) -m ruff format .
+	$(PY) -m ruff check --fix .
+
+lock: setup  ## resolve requirements.lock again
+	$(VENV)/bin/uv pip compile --universal --generate-hashes --no-emit-index-url --no-header -q pyproject.toml -o requirements.lock
