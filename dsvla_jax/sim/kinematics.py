@@ -1,0 +1,151 @@
+"""Forward and inverse kinematics of the Panda, per example in float32; vmap for batches.
+
+The chain is ``robot.py``'s. Poses are [x, y, z, qx, qy, qz, qw] of the tool centre point in the world frame.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dsvla_jax.geometry.rotations import (
+    matrix_to_quaternion,
+    normalize,
+    quaternion_conjugate,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from dsvla_jax.sim import robot
+from dsvla_jax.types import Array
+
+POSITION_TOLERANCE = 0.002  # metres
+ROTATION_TOLERANCE = 0.02  # radians
+
+# A posture in the middle of the table's workspace; joints that the pose leaves free drift towards it.
+REST_JOINTS = np.array([0.0, 0.1, 0.0, -2.0, 0.0, 2.1, 0.785], np.float32)
+_JOINT_LOW = (robot.JOINT_LOW + 0.005).astype(np.float32)
+_JOINT_HIGH = (robot.JOINT_HIGH - 0.005).astype(np.float32)
+
+
+def _rotation_from_wxyz(quaternion: np.ndarray) -> np.ndarray:
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+_LINK_ROTATIONS = np.stack([_rotation_from_wxyz(q) for q in robot.LINK_QUATERNIONS_WXYZ])
+# The hand and the tool centre point are rigid behind the last joint: one transform.
+_TOOL_ROTATION = _LINK_ROTATIONS[7] @ _rotation_from_wxyz(robot.TCP_QUATERNION_WXYZ)
+_TOOL_POSITION = robot.LINK_POSITIONS[7] + _LINK_ROTATIONS[7] @ robot.TCP_POSITION
+
+
+class Chain(NamedTuple):
+    """The arm at one posture, in the world. axes, origins: float32 (7, 3) of the joints. rotation (3, 3) and position
+    (3,) of the tool centre point."""
+
+    axes: Array
+    origins: Array
+    rotation: Array
+    position: Array
+
+
+def _chain(joints: Array, base: Array) -> Chain:
+    rotation, position = quaternion_to_matrix(base[3:]), base[:3]
+    axes, origins = [], []
+    cosines, sines = jnp.cos(joints), jnp.sin(joints)
+    for i in range(7):
+        position = position + rotation @ jnp.asarray(robot.LINK_POSITIONS[i], jnp.float32)
+        rotation = rotation @ jnp.asarray(_LINK_ROTATIONS[i], jnp.float32)
+        axes.append(rotation[:, 2])
+        origins.append(position)
+        c, s = cosines[i], sines[i]
+        x, y = rotation[:, 0], rotation[:, 1]
+        rotation = jnp.stack([c * x + s * y, c * y - s * x, rotation[:, 2]], axis=1)
+    position = position + rotation @ jnp.asarray(_TOOL_POSITION, jnp.float32)
+    rotation = rotation @ jnp.asarray(_TOOL_ROTATION, jnp.float32)
+    return Chain(jnp.stack(axes), jnp.stack(origins), rotation, position)
+
+
+def forward_kinematics(joints: Array, base: Array) -> Array:
+    """Joint angles (7,) of an arm whose base has the pose ``base`` (7,) -> pose (7,) of the tool centre point."""
+    chain = _chain(joints, base)
+    return jnp.concatenate([chain.position, matrix_to_quaternion(chain.rotation)])
+
+
+def _rotation_vector(quaternion: Array) -> Array:
+    """Unit quaternion (4,) -> axis times angle (3,), angle in [0, pi]."""
+    imaginary = quaternion[:3] * jnp.where(quaternion[3] < 0, -1.0, 1.0)
+    length = jnp.linalg.norm(imaginary)
+    angle = 2.0 * jnp.arctan2(length, jnp.abs(quaternion[3]))
+    return imaginary * jnp.where(length < 1e-6, 2.0, angle / jnp.maximum(length, 1e-6))
+
+
+def _pose_error(chain: Chain, target: Array) -> Array:
+    """(6,) translation in metres and rotation vector in radians that would bring the tool to the target pose."""
+    difference = quaternion_multiply(target[3:], quaternion_conjugate(matrix_to_quaternion(chain.rotation)))
+    return jnp.concatenate([target[:3] - chain.position, _rotation_vector(difference)])
+
+
+def _solve_spd(matrix: Array, right: Array) -> Array:
+    """Solves a small symmetric positive definite system, matrix (n, n), right (n, m), by unrolled Cholesky.
+
+    Batched small systems are slow through LAPACK on a CPU and through general solvers on accelerators.
+    """
+    n = matrix.shape[0]
+    rows, columns = list(right), []
+    for i in range(n):
+        pivot = jax.lax.rsqrt(matrix[i, i])
+        column = matrix[:, i] * pivot
+        columns.append((column, pivot))
+        rows[i] = rows[i] * pivot
+        for j in range(i + 1, n):
+            rows[j] = rows[j] - column[j] * rows[i]
+        matrix = matrix - jnp.outer(column, column)
+    for i in reversed(range(n)):
+        column, pivot = columns[i]
+        for j in range(i + 1, n):
+            rows[i] = rows[i] - column[j] * rows[j]
+        rows[i] = rows[i] * pivot
+    return jnp.stack(rows)
+
+
+def inverse_kinematics(pose: Array, seed: Array, base: Array, iterations: int = 20) -> tuple[Array, Array]:
+    """Joint angles that bring the tool centre point to ``pose``, found from ``seed``.
+
+    Damped least squares with the damping tied to the error (Sugihara 2011, "Solvability-unconcerned inverse
+    kinematics by the Levenberg-Marquardt method"), a step in the null space towards ``REST_JOINTS``, and the joint
+    limits as a clip after each step.
+
+    Args:
+        pose: float32 (7,). Its quaternion need not be normalised.
+        seed: float32 (7,). base: float32 (7,) pose of the arm's base in the world.
+        iterations: fixed, so that shapes and time are static.
+    Returns:
+        joints float32 (7,) within the limits, and ok: bool (), True if the pose is reached within 2 mm and 0.02 rad.
+    """
+    pose = jnp.concatenate([pose[:3], normalize(pose[3:])])
+
+    def step(joints: Array, _: None) -> tuple[Array, None]:
+        chain = _chain(joints, base)
+        error = _pose_error(chain, pose)
+        # A far target is approached in bounded steps: the linearisation holds only nearby.
+        error = error * jnp.minimum(1.0, 0.5 / jnp.maximum(jnp.linalg.norm(error), 1e-9))
+        linear = jnp.cross(chain.axes, chain.position - chain.origins)
+        jacobian = jnp.concatenate([linear, chain.axes], axis=1).T  # (6, 7)
+        damping = 0.02 * jnp.sum(error**2) + 1e-5
+        gram = jacobian @ jacobian.T + damping * jnp.eye(6, dtype=jnp.float32)
+        rest = 0.1 * (REST_JOINTS - joints)
+        change = rest + jacobian.T @ _solve_spd(gram, (error - jacobian @ rest)[:, None])[:, 0]
+        change = change * jnp.minimum(1.0, 1.0 / jnp.maximum(jnp.max(jnp.abs(change)), 1e-9))
+        return jnp.clip(joints + change, _JOINT_LOW, _JOINT_HIGH), None
+
+    joints, _ = jax.lax.scan(step, jnp.asarray(seed, jnp.float32), length=iterations)
+    error = _pose_error(_chain(joints, base), pose)
+    ok = (jnp.linalg.norm(error[:3]) < POSITION_TOLERANCE) & (jnp.linalg.norm(error[3:]) < ROTATION_TOLERANCE)
+    return joints, ok

@@ -1,0 +1,181 @@
+"""Physics: many episodes of one MuJoCo model at a time, by C MuJoCo or by MJX, behind one signature.
+
+``mujoco_stepper(model)`` and ``mjx_stepper(model)`` both return a function
+
+    run(state, controls, success_fn=None, eq_active=None) -> state
+
+that applies float32 controls (B, S, nu), one row a physics step, to every episode of the batch, and latches
+``state.succeeded`` wherever ``success_fn`` holds after some step. ``success_fn`` is per example and takes the state with
+the step's qpos; of the physical fields only qpos and what does not change within a run (mocap poses, params) may be
+read by it. ``eq_active`` bool (B, S, neq) switches equality constraints step by step; the last row stays in the state.
+"""
+
+import copy
+import os
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+from flax import struct
+
+from dsvla_jax.types import Array
+
+
+@struct.dataclass
+class SimState:
+    """The whole state of B episodes. Quaternions inside qpos and mocap_quat are wxyz, MuJoCo's order.
+
+    qpos: float32 (B, nq). qvel: float32 (B, nv). ctrl: float32 (B, nu), the last controls.
+    mocap_pos: float32 (B, nmocap, 3). mocap_quat: float32 (B, nmocap, 4).
+    eq_active: bool (B, neq). eq_data: float32 (B, neq, mjNEQDATA); the rows of welds hold the relative pose.
+    geom_xpos: float32 (B, ngeom, 3), geom_xmat: float32 (B, ngeom, 3, 3), world poses for the renderer.
+    geom_rgba: float32 (B, ngeom, 4).
+    succeeded: bool (B,), latched. ik_failed: bool (B,), latched: some commanded pose was out of reach.
+    diverged: bool (B,), latched: the physics became non-finite, and the state is that of before the run.
+    params: the task's own parameters, a dict of arrays (B, ...).
+    """
+
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+    mocap_pos: Array
+    mocap_quat: Array
+    eq_active: Array
+    eq_data: Array
+    geom_xpos: Array
+    geom_xmat: Array
+    geom_rgba: Array
+    succeeded: Array
+    ik_failed: Array
+    diverged: Array
+    params: dict[str, Array]
+
+
+SuccessFn = Callable[[SimState], Array]
+
+
+class Stepper(Protocol):
+    def __call__(
+        self, state: SimState, controls: Array, success_fn: SuccessFn | None = None, eq_active: Array | None = None
+    ) -> SimState: ...
+
+
+def initial_state(model: mujoco.MjModel, batch: int, params: dict[str, Array] | None = None) -> SimState:
+    """``batch`` copies of the model's reference configuration, at rest. ``params``: arrays with the batch in front."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+
+    def tile(array: np.ndarray, dtype: Any = np.float32) -> Array:
+        return jnp.asarray(np.broadcast_to(np.asarray(array, dtype), (batch, *np.shape(array))))
+
+    false = jnp.zeros(batch, bool)
+    return SimState(
+        qpos=tile(data.qpos),
+        qvel=tile(data.qvel),
+        ctrl=tile(data.ctrl),
+        mocap_pos=tile(data.mocap_pos),
+        mocap_quat=tile(data.mocap_quat),
+        eq_active=tile(data.eq_active, bool),
+        eq_data=tile(model.eq_data),
+        geom_xpos=tile(data.geom_xpos),
+        geom_xmat=tile(data.geom_xmat.reshape(-1, 3, 3)),
+        geom_rgba=tile(model.geom_rgba),
+        succeeded=false,
+        ik_failed=false,
+        diverged=false,
+        params=params or {},
+    )
+
+
+def success_over_steps(success_fn: SuccessFn, state: SimState, qpos: Array) -> Array:
+    """Whether the predicate holds at any of the steps. qpos (B, S, nq) -> bool (B,)."""
+
+    def one(state: SimState, qpos: Array) -> Array:
+        return jnp.any(jax.vmap(lambda q: success_fn(state.replace(qpos=q)))(qpos))
+
+    return jax.vmap(one)(state, qpos)
+
+
+class MujocoStepper:
+    """C MuJoCo in a pool of threads. Takes and returns arrays on the host; not for use under jit."""
+
+    def __init__(self, model: mujoco.MjModel, threads: int | None = None):
+        self.model = model
+        self._threads = threads or min(2, os.cpu_count() or 1)
+        self._pool = mujoco.rollout.Rollout(nthread=self._threads)
+        self._data = [mujoco.MjData(model) for _ in range(self._threads)]
+        # Weld poses are model fields, so each episode needs a model of its own.
+        self._models: list[mujoco.MjModel] = []
+        self._predicates: dict[SuccessFn, Callable[[SimState, Array], Array]] = {}
+
+    def __call__(
+        self, state: SimState, controls: Array, success_fn: SuccessFn | None = None, eq_active: Array | None = None
+    ) -> SimState:
+        model = self.model
+        batch, steps, nu = controls.shape
+        if nu != model.nu or batch != state.qpos.shape[0]:
+            raise ValueError(
+                f"controls: expected ({state.qpos.shape[0]}, steps, {model.nu}), got {tuple(controls.shape)}"
+            )
+        while len(self._models) < batch:
+            self._models.append(copy.copy(model))
+        eq_data, mocap_pos, mocap_quat = map(np.asarray, (state.eq_data, state.mocap_pos, state.mocap_quat))
+        mocap_bodies = np.flatnonzero(model.body_mocapid >= 0)
+        mocap_ids = model.body_mocapid[mocap_bodies]
+        for i in range(batch):
+            # A rollout whose controls do not name the mocap poses takes them from the model's body poses.
+            self._models[i].eq_data[:] = eq_data[i]
+            self._models[i].body_pos[mocap_bodies] = mocap_pos[i, mocap_ids]
+            self._models[i].body_quat[mocap_bodies] = mocap_quat[i, mocap_ids]
+        if eq_active is None:
+            eq_active = np.broadcast_to(np.asarray(state.eq_active)[:, None], (batch, steps, model.neq))
+        spec = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_EQ_ACTIVE)
+        inputs = np.concatenate([np.asarray(controls, np.float64), np.asarray(eq_active, np.float64)], axis=-1)
+        start = np.concatenate([np.zeros((batch, 1)), np.asarray(state.qpos), np.asarray(state.qvel)], axis=1)
+        if model.na or model.npluginstate:
+            raise ValueError("the model has actuator activations or plugins, which SimState does not carry; remove them")
+        history, _ = self._pool.rollout(self._models[:batch], self._data, start, inputs, control_spec=spec)
+
+        # MuJoCo resets an episode that diverges, and its clock with it.
+        expected = steps * model.opt.timestep
+        ok = np.isfinite(history).all(axis=(1, 2)) & (np.abs(history[:, -1, 0] - expected) < 0.5 * model.opt.timestep)
+        history = np.where(ok[:, None, None], history[..., 1:], start[:, None, 1:]).astype(np.float32)
+        qpos, qvel = history[..., : model.nq], history[..., model.nq :]
+        succeeded = np.asarray(state.succeeded)
+        if success_fn is not None:
+            if success_fn not in self._predicates:
+                self._predicates[success_fn] = jax.jit(
+                    lambda state, qpos: success_over_steps(success_fn, state, qpos)
+                )
+            succeeded = succeeded | (np.asarray(self._predicates[success_fn](state, qpos)) & ok)
+        state = state.replace(
+            qpos=qpos[:, -1],
+            qvel=qvel[:, -1],
+            ctrl=np.asarray(controls, np.float32)[:, -1],
+            eq_active=np.asarray(eq_active, bool)[:, -1],
+            succeeded=succeeded,
+            diverged=np.asarray(state.diverged) | ~ok,
+        )
+        return self.update_geometry(state)
+
+    def update_geometry(self, state: SimState) -> SimState:
+        """Sets geom_xpos and geom_xmat from qpos and the mocap poses."""
+        model, data = self.model, self._data[0]
+        qpos, mocap_pos, mocap_quat = map(np.asarray, (state.qpos, state.mocap_pos, state.mocap_quat))
+        batch = qpos.shape[0]
+        positions = np.empty((batch, model.ngeom, 3), np.float32)
+        matrices = np.empty((batch, model.ngeom, 9), np.float32)
+        for i in range(batch):
+            data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos[i], mocap_pos[i], mocap_quat[i]
+            mujoco.mj_kinematics(model, data)
+            positions[i], matrices[i] = data.geom_xpos, data.geom_xmat
+        return state.replace(geom_xpos=positions, geom_xmat=matrices.reshape(batch, model.ngeom, 3, 3))
+
+
+def mujoco_stepper(model: mujoco.MjModel, threads: int | None = None) -> MujocoStepper:
+    """The C stepper of ``model``; see the module's words for the signature."""
+    return MujocoStepper(model, threads)
