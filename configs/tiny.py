@@ -1,0 +1,39 @@
+"""The whole paper at a size that a laptop's processor trains in minutes, from scratch.
+
+What differs from the paper's profile, and why, is in docs/architecture.md under "The tiny configuration".
+"""
+
+from data_pipelines.samples import suite_tokenizer
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
+from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
+from dsvla_jax.training.experiment import DataConfig, Experiment, OptimizerConfig
+
+WIDTH = 128
+
+
+def config() -> Experiment:
+    return Experiment(
+        encoding=EncodingConfig(
+            image_size=96,
+            patch_size=16,
+            points=PointTokenizerConfig(num_points=256, group_sizes=(144, 72, 36), neighbours=8, width=WIDTH // 8),
+            style="compact",
+            max_text=48,
+        ),
+        model=ModelConfig(
+            vision=VisionConfig(image_size=96, patch_size=16, width=WIDTH, layers=3, heads=4),
+            language=LanguageConfig(vocab_size=suite_tokenizer().vocab_size, width=WIDTH, layers=3, heads=4, ffn=352),
+        ),
+        data=DataConfig(
+            episodes=150,
+            shift_world=0.2,
+            state_jitter=0.02,
+            keypoint_noise=0.01,
+            keypoint_noise_probability=0.2,
+        ),
+        optimizer=OptimizerConfig(learning_rate=2e-3),
+        steps=1200,
+        batch_size=32,
+        soft_target_sigma=1.5,
+    )

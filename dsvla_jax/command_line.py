@@ -1,0 +1,32 @@
+"""What the two programs and the `python -m` commands have in common at their outermost edge."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+
+from dsvla_jax.errors import UserError
+
+
+@contextlib.contextmanager
+def fail_with_message() -> Iterator[None]:
+    """Ends the program with one clear message and status 1 where the input, not the code, is at fault."""
+    try:
+        yield
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("stopped; the same command with --resume goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(130)
+
+
+def configure_jax() -> None:
+    """Keeps compiled programs on disk, so that the second run of anything starts at once."""
+    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dsvla_jax" / "xla"
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(default))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -1,0 +1,29 @@
+"""Which of a model's variables learn and which are frozen, as operations on nested dicts."""
+
+from typing import Any
+
+from flax import traverse_util
+
+PROJECTION = "projection"
+
+Variables = dict[str, Any]
+
+
+def split_variables(variables: Variables, regime: str) -> tuple[Variables, Variables]:
+    """The variables as (trainable, frozen).
+
+    `full`: everything learns. `lora`: the "lora" collection and the projection learn (paper, section 3.1).
+    """
+    flat = traverse_util.flatten_dict(variables)
+
+    def learns(path: tuple[str, ...]) -> bool:
+        return regime == "full" or path[0] == "lora" or path[1] == PROJECTION
+
+    trainable = {path: leaf for path, leaf in flat.items() if learns(path)}
+    frozen = {path: leaf for path, leaf in flat.items() if not learns(path)}
+    return traverse_util.unflatten_dict(trainable), traverse_util.unflatten_dict(frozen)
+
+
+def join_variables(trainable: Variables, frozen: Variables) -> Variables:
+    """The inverse of `split_variables`."""
+    return traverse_util.unflatten_dict(traverse_util.flatten_dict(frozen) | traverse_util.flatten_dict(trainable))

@@ -1,0 +1,100 @@
+"""What defines one training run. Every file of ``configs/`` returns one `Experiment`; a run folder keeps it as JSON."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Literal
+
+import cattrs
+
+from dsvla_jax.errors import UserError
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.model.config import ModelConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """Scripted-expert demonstrations and what is varied each time a sample is drawn from them."""
+
+    folder: str = "data/demos"
+    tasks: tuple[str, ...] = ("lamp_on", "put_rubbish_in_bin", "close_fridge", "bimanual_lift_ball")
+    episodes: int = 100
+    """Demonstrations a task."""
+    image_size: int = 96
+    """Rendered pixels a side."""
+    seed: int = 0
+    perturb: float = 0.03
+    """Metres by which half of the recorded poses leave the expert's path, each still labelled with the expert's next pose."""
+    shift_world: float = 0.0
+    """Metres: pose, keypoints, target and camera are moved by one random offset, so the picture stays true."""
+    state_jitter: float = 0.0
+    """Metres of noise on the stated current position, on half of the samples."""
+    keypoint_noise: float = 0.03
+    """Metres of uniform noise an axis on the keypoint (paper, section 3.3; the paper leaves its size open)."""
+    keypoint_noise_probability: float = 0.5
+    colour_variation: float = 0.0
+    """Relative strength of the brightness, contrast and colour variation; 0 turns it off."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimizerConfig:
+    """AdamW with linear warm-up and a cosine to `final_fraction` of the peak."""
+
+    learning_rate: float = 1e-3
+    warmup_steps: int = 50
+    final_fraction: float = 0.0
+    weight_decay: float = 0.05
+    beta1: float = 0.9
+    beta2: float = 0.95
+    gradient_clip: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConfig:
+    """Closed-loop evaluation on unseen episodes."""
+
+    episodes: int = 25
+    max_keyframes: int = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Everything that decides the outcome of a run."""
+
+    encoding: EncodingConfig
+    model: ModelConfig
+    data: DataConfig = DataConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    regime: Literal["full", "lora"] = "full"
+    """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
+    base: str = ""
+    """A finished run whose parameters are the frozen base of the `lora` regime; empty: random from the seed."""
+    steps: int = 1000
+    batch_size: int = 32
+    soft_target_sigma: float = 0.0
+    """Width, in bins, of the Gaussian that replaces one-hot targets on number tokens; 0 is the paper's cross-entropy."""
+    seed: int = 0
+    log_every: int = 20
+    checkpoint_every: int = 250
+
+    def __post_init__(self) -> None:
+        if self.regime == "lora" and self.model.lora is None:
+            raise UserError("regime: 'lora' needs adapters, but model.lora is None; give the config a LoraConfig")
+
+
+_converter = cattrs.Converter(forbid_extra_keys=True)
+
+
+def save_experiment(path: Path, experiment: Experiment) -> None:
+    """Writes the experiment as JSON."""
+    path.write_text(json.dumps(dataclasses.asdict(experiment), indent=2) + "\n")
+
+
+def load_experiment(path: Path) -> Experiment:
+    """Reads what `save_experiment` wrote. Raises UserError naming the file where it is not an experiment."""
+    try:
+        return _converter.structure(json.loads(path.read_text()), Experiment)
+    except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
+        details = "; ".join(cattrs.transform_error(error)) if isinstance(error, cattrs.BaseValidationError) else error
+        raise UserError(f"{path}: not an experiment of this version: {details}") from error

@@ -1,0 +1,84 @@
+"""The training step as a pure function, and the state that it carries."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+
+from dsvla_jax.encoding.encode import EncodingConfig, encode_observation
+from dsvla_jax.model.variables import Variables, join_variables
+from dsvla_jax.model.vla import VLA
+from dsvla_jax.training.experiment import Experiment, OptimizerConfig
+from dsvla_jax.training.objective import answer_loss, target_distributions
+from dsvla_jax.types import Array, Camera, ModelInputs, Observation
+
+@struct.dataclass
+class TrainState:
+    """step: int32 (). trainable: the variables that learn. optimizer: optax state over exactly those."""
+
+    step: Array
+    trainable: Variables
+    optimizer: optax.OptState
+
+
+def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
+    """AdamW; weight decay only on matrices, as norms, biases and embeddings of single rows are no places for it."""
+    warmup = min(config.warmup_steps, max(steps // 5, 1))
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, config.learning_rate, warmup, steps, end_value=config.learning_rate * config.final_fraction
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(config.gradient_clip),
+        optax.adamw(
+            schedule,
+            config.beta1,
+            config.beta2,
+            weight_decay=config.weight_decay,
+            mask=lambda tree: jax.tree_util.tree_map_with_path(
+                lambda path, leaf: leaf.ndim > 1 and "kernel" in jax.tree_util.keystr(path[-1:]), tree
+            ),
+        ),
+    )
+
+
+def observation_from_batch(batch: dict[str, Array]) -> Observation:
+    """The observation part of a batch of samples, leading axis B."""
+    camera = Camera(batch["intrinsics"], batch["world_from_camera"])
+    size = len(batch["rgb"])
+    # Pose and gripper reach the model as text; the picture's own encoding never reads them.
+    return Observation(batch["rgb"], batch["depth"], camera, jnp.zeros((size, 1, 7)), jnp.zeros((size, 1)))
+
+
+def model_inputs(batch: dict[str, Array], config: EncodingConfig) -> ModelInputs:
+    """The network's inputs for a batch of samples."""
+    picture = encode_observation(observation_from_batch(batch), config)
+    return ModelInputs(**picture, text_tokens=batch["text_tokens"], text_mask=batch["text_mask"])
+
+
+def make_train_step(
+    experiment: Experiment, model: VLA, optimizer: optax.GradientTransformation, number_values: np.ndarray
+) -> Callable[[TrainState, Variables, dict[str, Array]], tuple[TrainState, dict[str, Array]]]:
+    """``step(state, frozen, batch) -> (state, metrics)``, to be jitted by the caller.
+
+    Gradients are taken with respect to the trainable variables only: frozen parameters cost no weight gradient.
+    """
+    targets = jnp.asarray(target_distributions(number_values, experiment.soft_target_sigma))
+
+    def step(state: TrainState, frozen: Variables, batch: dict[str, Array]):
+        inputs = model_inputs(batch, experiment.encoding)
+
+        def loss_of(trainable: Variables):
+            logits = model.apply(join_variables(trainable, frozen), inputs)
+            assert isinstance(logits, jax.Array)
+            return answer_loss(logits, inputs.text_tokens, batch["answer_mask"], batch["soft_mask"], targets)
+
+        (_, metrics), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
+        updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.trainable)
+        trainable = optax.apply_updates(state.trainable, updates)
+        metrics["gradient_norm"] = optax.global_norm(gradients)
+        return TrainState(state.step + 1, trainable, optimizer_state), metrics
+
+    return step

@@ -1,0 +1,182 @@
+"""Train 3DS-VLA: python train.py CONFIG [--run DIR] [--resume] [--steps 500 --optimizer.learning-rate 3e-4 ...]
+
+CONFIG names a file of configs/. Demonstrations are generated first where they are missing. The run folder receives the
+config, the vocabulary, checkpoints, and metrics (metrics.jsonl and TensorBoard).
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tensorboardX import SummaryWriter
+from tqdm import tqdm
+
+from configs import config_names, get_config
+from data_pipelines.demos import generate_demonstrations
+from data_pipelines.episodes import EpisodeReader
+from data_pipelines.loader import make_loader
+from data_pipelines.samples import build_vocabulary, make_sampler
+from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.model.variables import split_variables
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.policy import PolicyConfig, load_policy, save_policy_config
+from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
+from dsvla_jax.training.sharding import batch_sharding, replicate
+from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+
+
+def main(
+    experiment: Annotated[Experiment, tyro.conf.arg(name="")], run: Path | None = None, resume: bool = False
+) -> None:
+    """Trains one experiment.
+
+    Args:
+        experiment: what to train; every field of the config can be overridden.
+        run: the run folder; runs/CONFIG if not given.
+        resume: go on from the newest checkpoint of the run folder; a finished run is left as it is.
+    """
+    assert run is not None
+    prepare_run_folder(run, experiment, resume)
+    data = experiment.data
+    generate_demonstrations(
+        Path(data.folder),
+        tasks=data.tasks,
+        episodes=data.episodes,
+        image_size=data.image_size,
+        seed=data.seed,
+        perturb=data.perturb,
+    )
+    reader = EpisodeReader(Path(data.folder), tasks=data.tasks, episodes=data.episodes)
+    tokenizer = build_vocabulary(data.tasks, experiment.encoding, experiment.model.language.vocab_size)
+    loader = make_loader(
+        reader, make_sampler(experiment, tokenizer), batch_size=experiment.batch_size, seed=experiment.seed
+    )
+
+    model = VLA(experiment.model)
+    variables = initial_variables(experiment, tokenizer.number_values)
+    trainable, frozen = split_variables(variables, experiment.regime)
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    report_size(trainable, frozen, len(reader))
+
+    checkpoints = RunCheckpoints(run)
+    if checkpoints.latest_step is not None:
+        frozen = checkpoints.restore_base(frozen)
+        restored = checkpoints.restore(state.trainable, state.optimizer)
+        state = TrainState(jnp.asarray(restored.step, jnp.int32), restored.trainable, restored.optimizer)
+        loader.set_state(restored.iterator)
+        print(f"resuming {run} at step {restored.step}")
+    else:
+        save_experiment(run / "config.json", experiment)
+        save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model), tokenizer)
+        checkpoints.save_base(frozen)
+
+    train_step = jax.jit(make_train_step(experiment, model, optimizer, tokenizer.number_values), donate_argnums=0)
+    state, frozen = replicate(state), replicate(frozen)
+    sharding = batch_sharding()
+    first = int(state.step)
+    with Metrics(run, first) as metrics, tqdm(total=experiment.steps, initial=first, unit="step", desc="train") as bar:
+        for step in range(first, experiment.steps):
+            batch = jax.device_put(next(loader), sharding)
+            if step == first:
+                bar.set_postfix_str("compiling the training step")
+            state, step_metrics = train_step(state, frozen, batch)
+            bar.update()
+            done = step + 1
+            if done % experiment.log_every == 0 or done == experiment.steps:
+                values = {name: float(value) for name, value in step_metrics.items()}
+                metrics.write(done, values)
+                bar.set_postfix_str(f"loss {values['loss']:.3f}, bins within one {values['bin_within_one']:.2f}")
+            if done % experiment.checkpoint_every == 0 or done == experiment.steps:
+                checkpoints.save(done, state.trainable, state.optimizer, loader.get_state())
+    checkpoints.close()
+    print(f"trained: {run} (evaluate it with: python eval.py {run})")
+
+
+def initial_variables(experiment: Experiment, number_values: np.ndarray) -> dict[str, Any]:
+    """The variables at step 0: random by the seed, or those of the base run with fresh adapters."""
+    variables = jax.jit(lambda: initialize(experiment.model, jax.random.key(experiment.seed), number_values))()
+    if experiment.base:
+        base = load_policy(Path(experiment.base)).variables
+        variables = {**variables, "params": base["params"]}
+    return variables
+
+
+def prepare_run_folder(run: Path, experiment: Experiment, resume: bool) -> None:
+    """Makes the run folder, or refuses one that holds other work."""
+    config = run / "config.json"
+    if config.exists():
+        if not resume:
+            raise CheckpointError(f"{run} already holds a run; go on with --resume, or choose another --run")
+        stored = load_experiment(config)
+        if stored != experiment:
+            fields = [name for name in vars(experiment) if getattr(stored, name) != getattr(experiment, name)]
+            raise CheckpointError(
+                f"{config}: this run was started with another config ({', '.join(fields)} differ); "
+                "resume it with the same one, or choose another --run"
+            )
+    run.mkdir(parents=True, exist_ok=True)
+
+
+def report_size(trainable: Any, frozen: Any, samples: int) -> None:
+    """Prints what will be trained."""
+    learn, rest = (sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (trainable, frozen))
+    print(f"{learn:,} trainable and {rest:,} frozen parameters; {samples:,} samples")
+
+
+class Metrics:
+    """Writes numbers to metrics.jsonl and to TensorBoard."""
+
+    def __init__(self, run: Path, step: int):
+        self._file = (run / "metrics.jsonl").open("a")
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=step)
+        self._clock = (step, time.monotonic())
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        last_step, last_time = self._clock
+        self._clock = (step, time.monotonic())
+        values = {**values, "seconds_per_step": (self._clock[1] - last_time) / max(step - last_step, 1)}
+        self._file.write(json.dumps({"step": step, **values}) + "\n")
+        self._file.flush()
+        for name, value in values.items():
+            self._board.add_scalar(name, value, step)
+
+    def __enter__(self) -> "Metrics":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._board.close()
+
+
+def command_line(arguments: list[str]) -> None:
+    """Parses `CONFIG --option value ...` and trains."""
+    if not arguments or arguments[0].startswith("-"):
+        print(__doc__)
+        print("configs:", ", ".join(config_names()))
+        sys.exit(0 if arguments else 2)
+    name, *rest = arguments
+    experiment = get_config(name)
+    configure_jax()
+
+    def run_it(
+        experiment: Annotated[Experiment, tyro.conf.arg(name="")] = experiment,
+        run: Path = Path("runs") / name,
+        resume: bool = False,
+    ) -> None:
+        main(experiment, run, resume)
+
+    run_it.__doc__ = main.__doc__
+    tyro.cli(run_it, args=rest, prog=f"train.py {name}")
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        command_line(sys.argv[1:])
