@@ -1,0 +1,83 @@
+"""Random variations of one recorded frame that keep it true: pure functions of (frame, generator) -> frame.
+
+None of them changes its argument. Compose them in the ``to_sample`` that ``loader.make_loader`` takes.
+"""
+
+import cv2
+import numpy as np
+
+from data_pipelines.records import Frame
+
+
+def random_offset(
+    rng: np.random.Generator, max_offset: np.ndarray | tuple[float, ...] | float, step: float = 0.01
+) -> np.ndarray:
+    """float32 (3,), uniform over the whole multiples of `step` metres within ±max_offset ((3,) or one for all axes).
+
+    Whole bins of the action text (1 cm) keep quantised text exactly consistent: every integer of an axis moves by the
+    same amount.
+    """
+    limit = np.rint(np.broadcast_to(np.asarray(max_offset, np.float64), (3,)) / step).astype(int)
+    return (rng.integers(-limit, limit + 1) * step).astype(np.float32)
+
+
+def shift_world(frame: Frame, offset: np.ndarray) -> Frame:
+    """Moves everything, the camera too, by offset (3,) metres: the picture stays as it is, its coordinates change.
+
+    A point cloud made from the shifted camera is shifted as well. A crop box in world coordinates is not, so prefer
+    horizontal offsets where the cloud is cropped at the height of the table.
+    """
+    offset = np.asarray(offset, np.float32)
+    if offset.shape != (3,):
+        raise ValueError(f"offset: expected shape (3,), got {offset.shape}; give one number an axis")
+    camera = frame["world_from_camera"].copy()
+    camera[:3, 3] += offset
+    return Frame(
+        **{
+            **frame,
+            "world_from_camera": camera,
+            "pose": _move(frame["pose"], offset),
+            "target_pose": _move(frame["target_pose"], offset),
+            "keypoint": frame["keypoint"] + offset,
+        }
+    )
+
+
+def jitter_state(frame: Frame, rng: np.random.Generator, max_offset: float, probability: float) -> Frame:
+    """With `probability`, moves the end-effector positions that the policy is told by up to ±max_offset metres an axis.
+
+    Target, keypoint and picture stay: the policy learns not to lean on the exact reading of its own state.
+    """
+    if rng.random() >= probability:
+        return frame
+    noise = rng.uniform(-max_offset, max_offset, (len(frame["pose"]), 3)).astype(np.float32)
+    return Frame(**{**frame, "pose": _move(frame["pose"], noise)})
+
+
+def perturb_keypoint(frame: Frame, rng: np.random.Generator, max_offset: float, probability: float) -> Frame:
+    """With `probability`, moves the keypoints by uniform noise of up to ±max_offset metres an axis."""
+    if rng.random() >= probability:
+        return frame
+    noise = rng.uniform(-max_offset, max_offset, frame["keypoint"].shape).astype(np.float32)
+    return Frame(**{**frame, "keypoint": frame["keypoint"] + noise})
+
+
+def vary_colour(frame: Frame, rng: np.random.Generator, strength: float = 0.15) -> Frame:
+    """Random brightness, contrast and saturation of up to ±strength, and a hue turn of up to strength * 20 degrees.
+
+    The hue turn stays small because instructions name colours.
+    """
+    brightness, contrast, saturation = 1 + rng.uniform(-strength, strength, 3)
+    hue = rng.uniform(-strength, strength) * 20
+    hsv = cv2.cvtColor(frame["rgb"].astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
+    hsv[..., 0] = (hsv[..., 0] + hue) % 360
+    hsv[..., 1] = np.clip(hsv[..., 1] * saturation, 0, 1)
+    rgb = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB) * brightness
+    rgb = (rgb - rgb.mean()) * contrast + rgb.mean()
+    return Frame(**{**frame, "rgb": np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)})
+
+
+def _move(poses: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    moved = poses.copy()
+    moved[:, :3] += offset
+    return moved

@@ -1,0 +1,197 @@
+"""Demonstration episodes on disk: array_record shards of episode records, and one ``index.json``.
+
+A shard is an array_record file (random access by number) of ``records.pack_episode``. The index lists every shard with
+its task, frame counts, size and sha256, because array_record itself reads a truncated file as an empty one.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
+
+from data_pipelines.records import DataError, Episode, Frame, decode_frame, pack_episode, unpack_episode
+
+FORMAT_NAME = "dsvla-episodes"
+FORMAT_VERSION = 1
+INDEX_FILE = "index.json"
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_shard(folder: Path, name: str, episodes: Sequence[Episode], **extra: Any) -> dict[str, Any]:
+    """Writes one shard (all episodes of one task) under its final name only once complete; returns its index entry.
+
+    `extra` is kept in the entry: the writer's own notes, which readers ignore.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    kinds = {(episode.task, episode.num_arms) for episode in episodes}
+    if len(kinds) > 1:
+        raise ValueError(f"shard {name}: expected episodes of one task, got {sorted(kinds)}; write one shard a task")
+    temporary = folder / f"{name}.partial"
+    # The pictures are compressed already; one record a chunk makes random access cheap.
+    writer = array_record_module.ArrayRecordWriter(str(temporary), "group_size:1,uncompressed")
+    for episode in episodes:
+        writer.write(pack_episode(episode))
+    writer.close()
+    entry = {
+        "file": name,
+        "task": episodes[0].task if episodes else "",
+        "num_arms": episodes[0].num_arms if episodes else 0,
+        "frames": [episode.num_frames for episode in episodes],
+        "bytes": temporary.stat().st_size,
+        "sha256": file_digest(temporary),
+        **extra,
+    }
+    os.replace(temporary, folder / name)
+    return entry
+
+
+def write_index(folder: Path, shards: Sequence[dict[str, Any]], settings: dict[str, Any] | None = None) -> None:
+    """Writes ``index.json`` atomically. `settings`: how the data were made, for whoever continues or reads them."""
+    index = {
+        "format": FORMAT_NAME,
+        "version": FORMAT_VERSION,
+        "episodes": sum(len(shard["frames"]) for shard in shards),
+        "frames": sum(sum(shard["frames"]) for shard in shards),
+        "settings": settings or {},
+        "shards": list(shards),
+    }
+    temporary = folder / f"{INDEX_FILE}.partial"
+    temporary.write_text(json.dumps(index, indent=1, sort_keys=True) + "\n")
+    os.replace(temporary, folder / INDEX_FILE)
+
+
+def read_index(folder: Path) -> dict[str, Any]:
+    """The checked contents of ``index.json``."""
+    path = folder / INDEX_FILE
+    fix = "generate the demonstrations with `python -m data_pipelines.demos`"
+    if not path.is_file():
+        raise DataError(path, "file", "an index of demonstrations", "no such file", fix)
+    try:
+        index = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise DataError(path, "file", "JSON", str(error), fix) from error
+    if not isinstance(index, dict) or index.get("format") != FORMAT_NAME:
+        raise DataError(path, "format", FORMAT_NAME, repr(index)[:60], fix)
+    if index.get("version") != FORMAT_VERSION:
+        raise DataError(path, "version", str(FORMAT_VERSION), repr(index.get("version")), fix + " again")
+    return index
+
+
+def check_shard(folder: Path, entry: dict[str, Any], digest: bool = False) -> None:
+    """Raises DataError unless the shard is there with the size (and, if asked, the sha256) that the index tells."""
+    path = folder / entry["file"]
+    fix = "delete it and run the program that wrote it again: it continues where files are missing"
+    if not path.is_file():
+        raise DataError(path, "shard", f"{entry['bytes']} bytes", "no such file", fix)
+    if path.stat().st_size != entry["bytes"]:
+        raise DataError(path, "size", f"{entry['bytes']} bytes", f"{path.stat().st_size} (truncated copy?)", fix)
+    if digest and (got := file_digest(path)) != entry["sha256"]:
+        raise DataError(path, "sha256", entry["sha256"], got, fix)
+
+
+def write_episodes(folder: Path | str, episodes: Iterable[Episode], per_shard: int = 20) -> None:
+    """Writes a whole data set at once: shards of up to `per_shard` episodes of one task, then the index."""
+    folder = Path(folder)
+    by_task: dict[str, list[Episode]] = {}
+    for episode in episodes:
+        by_task.setdefault(episode.task, []).append(episode)
+    shards = []
+    for task, group in sorted(by_task.items()):
+        for start in range(0, len(group), per_shard):
+            name = f"{task}-{start // per_shard:05d}.array_record"
+            shards.append(write_shard(folder, name, group[start : start + per_shard]))
+    write_index(folder, shards)
+
+
+class EpisodeReader:
+    """Random access to the episodes and frames of a folder.
+
+    Opening checks that every shard is complete; ``verify="sha256"`` reads them all and compares digests too.
+    Episodes and frames are numbered through all shards, task by task, in the order in which they were written.
+    tasks: which tasks; all if None. episodes: only the first so many of each task; all if None.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        tasks: Sequence[str] | None = None,
+        episodes: int | None = None,
+        verify: Literal["size", "sha256"] = "size",
+    ):
+        self.folder = Path(folder)
+        index = read_index(self.folder)
+        present = sorted({entry["task"] for entry in index["shards"] if entry["frames"]})
+        if missing := set(tasks or ()) - set(present):
+            raise DataError(
+                self.folder, "tasks", f"some of {present}", str(sorted(missing)), "generate them or choose others"
+            )
+        self.tasks = tuple(present if tasks is None else tasks)
+        self.settings: dict[str, Any] = index["settings"]
+        self._shards = [shard for task in self.tasks for shard in self._choose(index["shards"], task, episodes)]
+        if not self._shards:
+            raise DataError(self.folder, "shards", "at least one episode", "none", "generate demonstrations first")
+        for entry in self._shards:
+            check_shard(self.folder, entry, digest=verify == "sha256")
+        self.num_arms = {entry["task"]: entry["num_arms"] for entry in self._shards}
+        self._first_episode = np.cumsum([0] + [len(entry["frames"]) for entry in self._shards])
+        self._first_frame = np.cumsum([0] + [count for entry in self._shards for count in entry["frames"]])
+        self._open: dict[int, Any] = {}
+
+    def _choose(self, shards: Sequence[dict[str, Any]], task: str, episodes: int | None) -> list[dict[str, Any]]:
+        """The task's shards, cut down to the first `episodes` of it."""
+        mine = [shard for shard in shards if shard["task"] == task]
+        count = sum(len(shard["frames"]) for shard in mine)
+        if episodes is not None and count < episodes:
+            fix = f"run `python -m data_pipelines.demos {self.folder} --tasks {task} --episodes {episodes}`"
+            raise DataError(self.folder, f"episodes of {task}", f"at least {episodes}", str(count), fix)
+        chosen, left = [], count if episodes is None else episodes
+        for shard in mine:
+            chosen.append({**shard, "frames": shard["frames"][:left]})
+            left -= len(chosen[-1]["frames"])
+        return [shard for shard in chosen if shard["frames"]]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Open files do not travel to worker processes; each opens its own.
+        return {**self.__dict__, "_open": {}}
+
+    def __len__(self) -> int:
+        return int(self._first_episode[-1])
+
+    @property
+    def num_frames(self) -> int:
+        return int(self._first_frame[-1])
+
+    def episode(self, number: int) -> Episode:
+        """The episode of that number, pictures still encoded."""
+        if not 0 <= number < len(self):
+            raise IndexError(f"episode {number} of {self.folder}: expected 0 to {len(self) - 1}")
+        shard = int(np.searchsorted(self._first_episode, number, side="right")) - 1
+        path = self.folder / self._shards[shard]["file"]
+        if shard not in self._open:
+            self._open[shard] = array_record_module.ArrayRecordReader(str(path), options="readahead_buffer_size:0")
+        place = number - int(self._first_episode[shard])
+        (record,) = self._open[shard].read([place])
+        return unpack_episode(record, f"{path}, episode {place}")
+
+    def locate(self, frame: int) -> tuple[int, int]:
+        """(episode, frame in that episode) of a frame number."""
+        if not 0 <= frame < self.num_frames:
+            raise IndexError(f"frame {frame} of {self.folder}: expected 0 to {self.num_frames - 1}")
+        episode = int(np.searchsorted(self._first_frame, frame, side="right")) - 1
+        return episode, frame - int(self._first_frame[episode])
+
+    def frame(self, number: int) -> Frame:
+        """The frame of that number; only its own pictures are decoded."""
+        episode_number, place = self.locate(number)
+        episode = self.episode(episode_number)
+        return decode_frame(episode, place, task_index=self.tasks.index(episode.task), episode_number=episode_number)

@@ -1,0 +1,272 @@
+"""One demonstration episode as a record of bytes, and one frame of it as a training sample.
+
+A record is a msgpack map of text, integers, arrays (``{"dtype", "shape", "data"}``, little-endian) and, for every
+recorded frame, an RGB picture as PNG and its depth as a 16-bit PNG in units of 0.1 mm (0 = missing reading). Nothing
+is ever unpickled.
+
+Axes: F recorded frames of an episode, and A, H, W, K of ``dsvla_jax.types``. World frame, metres, xyzw quaternions.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, TypedDict, cast
+
+import cv2
+import msgpack
+import numpy as np
+from numpy.typing import ArrayLike
+
+RECORD_VERSION = 1
+DEPTH_UNIT = 1e-4
+MAX_DEPTH = 65535 * DEPTH_UNIT
+
+_DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1", "|b1")
+_PICTURES = ("rgb_png", "depth_png")
+
+
+class DataError(ValueError):
+    """Recorded data that must not be used: says which file and field, what was expected, and what to do about it."""
+
+    def __init__(self, where: object, field: str, expected: str, got: str, fix: str):
+        super().__init__(f"{where}: {field}: expected {expected}, got {got}; {fix}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """One demonstration: what was seen before each key action, and the key action that the demonstrator took next.
+
+    rgb_png, depth_png: F encoded pictures each (see ``encode_rgb`` and ``encode_depth``).
+    intrinsics: float32 (F, 3, 3). world_from_camera: float32 (F, 4, 4).
+    pose: float32 (F, A, 7). gripper_open: float32 (F, A). The state in which the frame was recorded.
+    target_pose: float32 (F, A, 7). target_gripper: float32 (F, A). The next key pose.
+    keypoints: float32 (A, K, 3), in the order of the instruction. active_keypoint: float32 (F, A, 3).
+    seed: the number of the episode in its seed stream.
+    """
+
+    task: str
+    instruction: str
+    seed: int
+    rgb_png: tuple[bytes, ...]
+    depth_png: tuple[bytes, ...]
+    intrinsics: np.ndarray
+    world_from_camera: np.ndarray
+    pose: np.ndarray
+    gripper_open: np.ndarray
+    target_pose: np.ndarray
+    target_gripper: np.ndarray
+    keypoints: np.ndarray
+    active_keypoint: np.ndarray
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.rgb_png)
+
+    @property
+    def num_arms(self) -> int:
+        return self.pose.shape[1]
+
+
+class Frame(TypedDict):
+    """One training sample before tokenisation: a frame of an episode with its pictures decoded.
+
+    rgb: uint8 (H, W, 3). depth: float32 (H, W), metres, 0 where missing. intrinsics: float32 (3, 3).
+    world_from_camera: float32 (4, 4). pose: float32 (A, 7). gripper_open: float32 (A,). keypoint: float32 (A, 3), the
+    active one of each arm. target_pose: float32 (A, 7). target_gripper: float32 (A,). task_index: into
+    ``EpisodeReader.tasks``. episode: number in the reader. frame: number in the episode.
+    """
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    intrinsics: np.ndarray
+    world_from_camera: np.ndarray
+    pose: np.ndarray
+    gripper_open: np.ndarray
+    keypoint: np.ndarray
+    target_pose: np.ndarray
+    target_gripper: np.ndarray
+    instruction: str
+    task: str
+    task_index: int
+    episode: int
+    frame: int
+
+
+def encode_rgb(rgb: np.ndarray) -> bytes:
+    """PNG of uint8 (H, W, 3)."""
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[-1] != 3:
+        raise DataError("encode_rgb", "rgb", "uint8 (H, W, 3)", f"{rgb.dtype} {rgb.shape}", "convert the picture first")
+    return _png(np.ascontiguousarray(rgb[..., ::-1]))
+
+
+def encode_depth(depth: np.ndarray) -> bytes:
+    """16-bit PNG of float (H, W) planar depth in metres, rounded to 0.1 mm; 0 marks a missing reading."""
+    if depth.ndim != 2:
+        raise DataError("encode_depth", "depth", "(H, W)", str(depth.shape), "drop the extra axes")
+    if not np.all(np.isfinite(depth)):
+        count = int(np.sum(~np.isfinite(depth)))
+        raise DataError(
+            "encode_depth", "depth", "finite values", f"{count} non-finite pixels", "write 0 for a missing reading"
+        )
+    if depth.min() < 0 or depth.max() > MAX_DEPTH:
+        span = f"{depth.min():.4g} to {depth.max():.4g}"
+        raise DataError(
+            "encode_depth", "depth", f"0 to {MAX_DEPTH} m", span, "convert to metres and write 0 beyond the range"
+        )
+    return _png(np.rint(depth / DEPTH_UNIT).astype(np.uint16))
+
+
+def decode_rgb(data: bytes) -> np.ndarray:
+    """uint8 (H, W, 3) of a PNG or JPEG."""
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise DataError("decode_rgb", "rgb_png", "a PNG", f"{len(data)} undecodable bytes", "generate the data again")
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def decode_depth(data: bytes) -> np.ndarray:
+    """float32 (H, W) metres of a 16-bit PNG of ``encode_depth``."""
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.dtype != np.uint16 or picture.ndim != 2:
+        got = "undecodable bytes" if picture is None else f"{picture.dtype} {picture.shape}"
+        raise DataError("decode_depth", "depth_png", "a 16-bit grey PNG", got, "generate the data again")
+    # In float64 first, so that the nearest float32 of the decimal value comes out.
+    return (picture * DEPTH_UNIT).astype(np.float32)
+
+
+def _png(picture: np.ndarray) -> bytes:
+    ok, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not ok:
+        raise DataError("png", "picture", "an encodable array", f"{picture.dtype} {picture.shape}", "check its shape")
+    return data.tobytes()
+
+
+def make_episode(
+    *,
+    task: str,
+    instruction: str,
+    seed: int,
+    rgb: Sequence[np.ndarray] | np.ndarray,
+    depth: Sequence[np.ndarray] | np.ndarray,
+    intrinsics: ArrayLike,
+    world_from_camera: ArrayLike,
+    pose: ArrayLike,
+    gripper_open: ArrayLike,
+    target_pose: ArrayLike,
+    target_gripper: ArrayLike,
+    keypoints: ArrayLike,
+    active_keypoint: ArrayLike,
+) -> Episode:
+    """Encodes the pictures, rgb uint8 F x (H, W, 3) and depth F x (H, W); a camera without the F axis is repeated."""
+    frames = len(rgb)
+
+    def per_frame(matrix: ArrayLike, size: int) -> np.ndarray:
+        return np.array(np.broadcast_to(np.asarray(matrix, np.float32), (frames, size, size)))
+
+    episode = Episode(
+        task=task,
+        instruction=instruction,
+        seed=int(seed),
+        rgb_png=tuple(encode_rgb(np.asarray(x)) for x in rgb),
+        depth_png=tuple(encode_depth(np.asarray(x)) for x in depth),
+        intrinsics=per_frame(intrinsics, 3),
+        world_from_camera=per_frame(world_from_camera, 4),
+        pose=np.asarray(pose, np.float32),
+        gripper_open=np.asarray(gripper_open, np.float32),
+        target_pose=np.asarray(target_pose, np.float32),
+        target_gripper=np.asarray(target_gripper, np.float32),
+        keypoints=np.asarray(keypoints, np.float32),
+        active_keypoint=np.asarray(active_keypoint, np.float32),
+    )
+    check_episode(episode, f"episode {seed} of {task}")
+    return episode
+
+
+def check_episode(episode: Episode, where: object) -> None:
+    """Raises DataError unless all shapes agree and every number is finite."""
+    frames = episode.num_frames
+    arms = episode.pose.shape[1] if episode.pose.ndim == 3 else 1
+    keypoints = episode.keypoints.shape[1] if episode.keypoints.ndim == 3 else 1
+    expected = {
+        "intrinsics": (frames, 3, 3),
+        "world_from_camera": (frames, 4, 4),
+        "pose": (frames, arms, 7),
+        "gripper_open": (frames, arms),
+        "target_pose": (frames, arms, 7),
+        "target_gripper": (frames, arms),
+        "keypoints": (arms, keypoints, 3),
+        "active_keypoint": (frames, arms, 3),
+    }
+    fix = "generate the data again, or correct the importer that wrote it"
+    if frames == 0 or len(episode.depth_png) != frames:
+        raise DataError(where, "depth_png", f"{max(frames, 1)} pictures", str(len(episode.depth_png)), fix)
+    for field, shape in expected.items():
+        value = getattr(episode, field)
+        if value.shape != shape or value.dtype != np.float32:
+            raise DataError(where, field, f"float32 {shape}", f"{value.dtype} {value.shape}", fix)
+        if not np.all(np.isfinite(value)):
+            raise DataError(where, field, "finite numbers", f"{int(np.sum(~np.isfinite(value)))} non-finite", fix)
+
+
+def pack_episode(episode: Episode) -> bytes:
+    """The record of an episode; equal episodes give equal bytes."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+            return {"dtype": little.dtype.str, "shape": list(little.shape), "data": little.tobytes()}
+        return list(value) if isinstance(value, tuple) else value
+
+    fields = {field.name: plain(getattr(episode, field.name)) for field in dataclasses.fields(episode)}
+    return cast(bytes, msgpack.packb({"version": RECORD_VERSION, **fields}, use_bin_type=True))
+
+
+def unpack_episode(record: bytes, where: object = "episode record") -> Episode:
+    """The inverse of ``pack_episode``; `where` names the record in errors."""
+    fix = "generate the data again"
+    try:
+        fields = msgpack.unpackb(record, raw=False)
+    except (msgpack.exceptions.UnpackException, ValueError) as error:
+        raise DataError(where, "record", "a msgpack map", f"{len(record)} unreadable bytes ({error})", fix) from error
+    version = fields.get("version") if isinstance(fields, dict) else None
+    if version != RECORD_VERSION:
+        raise DataError(where, "version", str(RECORD_VERSION), repr(version), fix)
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(Episode):
+        if field.name not in fields:
+            raise DataError(where, field.name, "to be present", "nothing", fix)
+        value = fields[field.name]
+        if field.type is np.ndarray:
+            value = _unpack_array(value, where, field.name)
+        values[field.name] = tuple(value) if field.name in _PICTURES else value
+    episode = Episode(**values)
+    check_episode(episode, where)
+    return episode
+
+
+def _unpack_array(value: Any, where: object, field: str) -> np.ndarray:
+    if not isinstance(value, dict) or value.get("dtype") not in _DTYPES:
+        raise DataError(where, field, f"an array of {_DTYPES}", repr(value)[:60], "generate the data again")
+    dtype, shape, data = np.dtype(value["dtype"]), tuple(value["shape"]), value["data"]
+    if len(data) != dtype.itemsize * int(np.prod(shape)):
+        raise DataError(where, field, f"the bytes of {shape}", f"{len(data)} bytes", "generate the data again")
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def decode_frame(episode: Episode, place: int, task_index: int = 0, episode_number: int = 0) -> Frame:
+    """One frame of an episode as a sample, with writable arrays."""
+    return Frame(
+        rgb=decode_rgb(episode.rgb_png[place]),
+        depth=decode_depth(episode.depth_png[place]),
+        intrinsics=episode.intrinsics[place].copy(),
+        world_from_camera=episode.world_from_camera[place].copy(),
+        pose=episode.pose[place].copy(),
+        gripper_open=episode.gripper_open[place].copy(),
+        keypoint=episode.active_keypoint[place].copy(),
+        target_pose=episode.target_pose[place].copy(),
+        target_gripper=episode.target_gripper[place].copy(),
+        instruction=episode.instruction,
+        task=episode.task,
+        task_index=task_index,
+        episode=episode_number,
+        frame=place,
+    )

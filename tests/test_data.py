@@ -1,0 +1,285 @@
+"""Episodes on disk, the loader and the augmentations, over small pictures with known contents."""
+
+import copy
+import dataclasses
+import itertools
+import json
+import pickle
+
+import jax
+import numpy as np
+import pytest
+
+from data_pipelines import augment
+from data_pipelines.episodes import EpisodeReader, write_episodes
+from data_pipelines.loader import make_loader
+from data_pipelines.records import (
+    DataError,
+    decode_depth,
+    decode_frame,
+    decode_rgb,
+    encode_depth,
+    encode_rgb,
+    make_episode,
+    pack_episode,
+    unpack_episode,
+)
+from dsvla_jax.sim.seeds import episode_keys
+
+
+def random_episode(seed, task="lamp_on", arms=1, frames=3, size=8):
+    rng = np.random.default_rng(seed)
+    camera = np.eye(4)
+    camera[:3, :3] = [[0, -0.42262, -0.90631], [-1, 0, 0], [0, 0.90631, -0.42262]]
+    camera[:3, 3] = 1.35, 0, 1.58
+    return make_episode(
+        task=task,
+        instruction=f"do {task} number {seed}",
+        seed=seed,
+        rgb=rng.integers(0, 256, (frames, size, size, 3), np.uint8),
+        depth=rng.uniform(0.5, 3, (frames, size, size)),
+        intrinsics=[[-100, 0, size / 2], [0, -100, size / 2], [0, 0, 1]],
+        world_from_camera=camera,
+        pose=rng.uniform(-1, 1, (frames, arms, 7)),
+        gripper_open=rng.integers(0, 2, (frames, arms)),
+        target_pose=rng.uniform(-1, 1, (frames, arms, 7)),
+        target_gripper=rng.integers(0, 2, (frames, arms)),
+        keypoints=rng.uniform(-1, 1, (arms, 2, 3)),
+        active_keypoint=rng.uniform(-1, 1, (frames, arms, 3)),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_episodes(tmp_path, [random_episode(seed, frames=1 + seed % 4) for seed in range(7)], per_shard=3)
+    return tmp_path
+
+
+def assert_equal_episodes(one, other):
+    for field in dataclasses.fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+
+
+def test_pictures_survive_encoding():
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (9, 7, 3), np.uint8)
+    depth = rng.uniform(0, 6.5, (9, 7))
+    depth[0, 0] = 0
+    np.testing.assert_array_equal(decode_rgb(encode_rgb(rgb)), rgb)
+    np.testing.assert_allclose(decode_depth(encode_depth(depth)), depth, atol=0.51e-4)
+    assert decode_depth(encode_depth(depth))[0, 0] == 0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -0.1, 7.0])
+def test_impossible_depth_is_refused(bad):
+    depth = np.ones((4, 4))
+    depth[1, 2] = bad
+    with pytest.raises(DataError, match=r"depth: expected .*; .*write 0"):
+        encode_depth(depth)
+
+
+def test_record_roundtrip_and_determinism():
+    episode = random_episode(3, arms=2)
+    assert_equal_episodes(unpack_episode(pack_episode(episode)), episode)
+    assert pack_episode(random_episode(3, arms=2)) == pack_episode(episode)
+
+
+def test_non_finite_numbers_are_refused():
+    episode = random_episode(0)
+    pose = episode.pose.copy()
+    pose[0, 0, 0] = np.nan
+    with pytest.raises(DataError, match="shard-7: pose: expected finite"):
+        unpack_episode(pack_episode(dataclasses.replace(episode, pose=pose)), "shard-7")
+
+
+def test_pickle_is_not_read():
+    with pytest.raises(DataError):
+        unpack_episode(pickle.dumps({"version": 1}))
+
+
+def test_reader_numbers_all_episodes_and_frames(folder):
+    reader = EpisodeReader(folder, verify="sha256")
+    assert len(reader) == 7
+    assert reader.num_frames == sum(1 + seed % 4 for seed in range(7))
+    for seed in range(7):
+        assert_equal_episodes(reader.episode(seed), random_episode(seed, frames=1 + seed % 4))
+    seen = [reader.locate(number) for number in range(reader.num_frames)]
+    assert seen == [(seed, place) for seed in range(7) for place in range(1 + seed % 4)]
+    frame = reader.frame(seen.index((5, 1)))
+    assert frame["instruction"] == "do lamp_on number 5"
+    np.testing.assert_array_equal(frame["pose"], random_episode(5, frames=2).pose[1])
+    assert len(EpisodeReader(folder, episodes=4)) == 4
+    with pytest.raises(DataError, match="episodes of lamp_on: expected at least 8, got 7; run"):
+        EpisodeReader(folder, episodes=8)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).frame(2)["rgb"], reader.frame(2)["rgb"])
+
+
+def test_writing_twice_gives_the_same_bytes(folder, tmp_path_factory):
+    again = tmp_path_factory.mktemp("again")
+    write_episodes(again, [random_episode(seed, frames=1 + seed % 4) for seed in range(7)], per_shard=3)
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == sorted(path.name for path in again.iterdir())
+    for name in names:
+        assert (folder / name).read_bytes() == (again / name).read_bytes()
+
+
+def test_damaged_folders_are_refused(folder):
+    shard = folder / "lamp_on-00001.array_record"
+    data = shard.read_bytes()
+    shard.write_bytes(data[: len(data) // 2])
+    with pytest.raises(DataError, match=r"lamp_on-00001.array_record: size: expected \d+ bytes, got .*truncated"):
+        EpisodeReader(folder)
+    place = data.index(b"PNG")
+    shard.write_bytes(data[:place] + b"GNP" + data[place + 3 :])
+    with pytest.raises(DataError, match="sha256"):
+        EpisodeReader(folder, verify="sha256")
+    shard.unlink()
+    with pytest.raises(DataError, match="no such file; delete it and run"):
+        EpisodeReader(folder)
+    shard.write_bytes(data)
+    with pytest.raises(DataError, match="tasks: expected some of"):
+        EpisodeReader(folder, tasks=["lamp_off"])
+    index = json.loads((folder / "index.json").read_text())
+    (folder / "index.json").write_text(json.dumps({**index, "version": 99}))
+    with pytest.raises(DataError, match="version: expected 1, got 99"):
+        EpisodeReader(folder)
+    (folder / "index.json").unlink()
+    with pytest.raises(DataError, match=r"python -m data_pipelines\.demos"):
+        EpisodeReader(folder)
+
+
+def identities(batches):
+    return [(int(e), int(f)) for batch in batches for e, f in zip(batch["episode"], batch["frame"], strict=True)]
+
+
+def test_an_epoch_is_every_frame_once_in_a_new_order(folder):
+    reader = EpisodeReader(folder)
+    count = reader.num_frames
+    stream = identities(
+        batch for batch, _ in zip(make_loader(reader, batch_size=1, seed=3), range(2 * count), strict=False)
+    )
+    everything = [reader.locate(number) for number in range(count)]
+    first, second = stream[:count], stream[count:]
+    assert sorted(first) == sorted(second) == everything
+    assert first != everything
+    assert first != second
+    other = identities(batch for batch, _ in zip(make_loader(reader, batch_size=1, seed=4), range(count), strict=False))
+    assert other != first
+    assert identities(make_loader(reader, batch_size=1, seed=3, shuffle=False, num_epochs=1)) == everything
+
+
+def test_batches_have_stacked_fields(folder):
+    batch = next(make_loader(EpisodeReader(folder), batch_size=4, seed=0))
+    shapes = {name: (value.shape, value.dtype) for name, value in batch.items()}
+    assert shapes["rgb"] == ((4, 8, 8, 3), np.uint8)
+    assert shapes["depth"] == ((4, 8, 8), np.float32)
+    assert shapes["world_from_camera"] == ((4, 4, 4), np.float32)
+    assert shapes["pose"] == shapes["target_pose"] == ((4, 1, 7), np.float32)
+    assert shapes["keypoint"] == ((4, 1, 3), np.float32)
+    assert [str(text)[:10] for text in batch["instruction"]] == ["do lamp_on"] * 4
+
+
+def test_resumed_iterator_continues_exactly(folder):
+    def sample(frame, rng):
+        frame = augment.perturb_keypoint(frame, rng, 0.03, 0.5)
+        return {name: frame[name] for name in ("rgb", "keypoint", "episode", "frame")}
+
+    iterator = make_loader(EpisodeReader(folder), sample, batch_size=4, seed=1)
+    for _ in range(6):
+        next(iterator)
+    state = json.loads(json.dumps(iterator.get_state()))
+    expected = [next(iterator) for _ in range(5)]
+    resumed = make_loader(EpisodeReader(folder), sample, batch_size=4, seed=1)
+    resumed.set_state(state)
+    for batch in expected:
+        jax.tree.map(np.testing.assert_array_equal, next(resumed), batch)
+
+
+def test_processes_share_the_samples_out(folder):
+    reader = EpisodeReader(folder)
+
+    def stream(count, **split):
+        return identities(
+            batch for batch, _ in zip(make_loader(reader, batch_size=1, seed=5, **split), range(count), strict=False)
+        )
+
+    whole = stream(20)
+    assert [
+        x for pair in zip(*(stream(10, process_index=i, process_count=2) for i in (0, 1)), strict=True) for x in pair
+    ] == whole
+
+
+def test_mixed_arms_need_a_text_sample(tmp_path):
+    write_episodes(tmp_path, [random_episode(0), random_episode(1, task="push_box", arms=2)])
+    reader = EpisodeReader(tmp_path)
+    with pytest.raises(ValueError, match="pass `to_sample`"):
+        make_loader(reader, batch_size=2, seed=0)
+
+    def sample(frame, rng):
+        return {"rgb": frame["rgb"], "task": frame["task_index"]}
+
+    batch = next(make_loader(reader, sample, batch_size=6, seed=0))
+    assert sorted(batch["task"]) == [0, 0, 0, 1, 1, 1]
+    assert EpisodeReader(tmp_path, tasks=["push_box"]).num_arms == {"push_box": 2}
+
+
+def project(points, frame):
+    """Pixels of world points, written out with homogeneous matrices."""
+    camera = np.linalg.inv(frame["world_from_camera"].astype(np.float64)) @ np.append(points, 1.0)
+    pixel = frame["intrinsics"].astype(np.float64) @ camera[:3]
+    return pixel[:2] / pixel[2]
+
+
+def test_shift_world_keeps_every_pixel():
+    rng = np.random.default_rng(0)
+    frame = decode_frame(random_episode(0), 1)
+    offset = augment.random_offset(rng, (0.3, 0.3, 0.1))
+    shifted = augment.shift_world(frame, offset)
+    for field in ("pose", "target_pose", "keypoint"):
+        np.testing.assert_allclose(
+            project(shifted[field][0, :3], shifted), project(frame[field][0, :3], frame), atol=1e-3
+        )
+        np.testing.assert_allclose(shifted[field][0, :3] - frame[field][0, :3], offset, atol=1e-6)
+    np.testing.assert_array_equal(shifted["pose"][:, 3:], frame["pose"][:, 3:])
+    assert shifted["rgb"] is frame["rgb"]
+
+
+def test_offsets_are_whole_centimetres():
+    rng = np.random.default_rng(0)
+    offsets = np.stack([augment.random_offset(rng, (0.05, 0.02, 0)) for _ in range(500)])
+    centimetres = offsets * 100
+    np.testing.assert_allclose(centimetres, np.rint(centimetres), atol=1e-5)
+    np.testing.assert_array_equal(np.rint(centimetres).max(0), [5, 2, 0])
+    np.testing.assert_array_equal(np.rint(centimetres).min(0), [-5, -2, 0])
+
+
+def test_noise_changes_what_it_says_and_nothing_else():
+    frame = decode_frame(random_episode(0), 0)
+    before = {name: copy.deepcopy(value) for name, value in frame.items()}
+    variations = {
+        "pose": lambda rng: augment.jitter_state(frame, rng, 0.02, 1.0),
+        "keypoint": lambda rng: augment.perturb_keypoint(frame, rng, 0.03, 1.0),
+        "rgb": lambda rng: augment.vary_colour(frame, rng),
+    }
+    for changed, vary in variations.items():
+        result = vary(np.random.default_rng(1))
+        again = vary(np.random.default_rng(1))
+        for name in frame:
+            np.testing.assert_array_equal(frame[name], before[name])
+            np.testing.assert_array_equal(result[name], again[name])
+            assert np.array_equal(result[name], frame[name]) == (name != changed)
+    moved = variations["keypoint"](np.random.default_rng(2))["keypoint"] - frame["keypoint"]
+    assert 0 < np.abs(moved).max() <= 0.03 + 1e-6
+    assert augment.perturb_keypoint(frame, np.random.default_rng(0), 0.03, 0.0) is frame
+    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0)["rgb"], frame["rgb"])
+
+
+def test_episode_keys_depend_on_the_number_alone():
+    data = jax.random.key_data
+    keys = data(episode_keys(0, "train", "lamp_on", 0, 10))
+    np.testing.assert_array_equal(data(episode_keys(0, "train", "lamp_on", 4, 3)), keys[4:7])
+    streams = itertools.product((0, 1), ("train", "eval"), ("lamp_on", "close_fridge"))
+    every = np.concatenate([data(episode_keys(*stream, 0, 300)) for stream in streams])
+    assert len({tuple(key) for key in every.tolist()}) == len(every)
+    with pytest.raises(ValueError, match="split: expected one of"):
+        episode_keys(0, "test", "lamp_on", 0, 1)
