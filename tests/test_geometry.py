@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +57,7 @@ def test_front_camera_golden_pixels(point, pixel, depth):
 def test_project_undoes_unproject_on_integer_pixels():
     height, width = 24, 40
     camera = front_camera(40)
-    camera = camera.replace(intrinsics=resize_intrinsics(camera.intrinsics, (40, 40), (height, width)))
+    camera = dataclasses.replace(camera, intrinsics=resize_intrinsics(camera.intrinsics, (40, 40), (height, width)))
     depth = np.random.default_rng(0).uniform(0.3, 3.0, (height, width)).astype(np.float32)
     uv, z = project(unproject(jnp.asarray(depth), camera), camera)
     u, v = np.meshgrid(np.arange(width), np.arange(height))

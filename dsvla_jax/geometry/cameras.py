@@ -8,6 +8,7 @@ unprojects integer pixel indices, without half a pixel.
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from dsvla_jax.types import Array, Camera
 
@@ -28,7 +29,7 @@ FRONT_WORLD_FROM_CAMERA = np.array(
 FRONT_FIELD_OF_VIEW = float(np.deg2rad(40.0))
 
 
-def make_camera(world_from_camera: Array, fov_radians: float, height: int, width: int) -> Camera:
+def make_camera(world_from_camera: ArrayLike, fov_radians: float, height: int, width: int) -> Camera:
     """A camera with square pixels and the optical axis at (width / 2, height / 2).
 
     Args:
@@ -39,7 +40,7 @@ def make_camera(world_from_camera: Array, fov_radians: float, height: int, width
     intrinsics = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]], np.float32)
     return Camera(
         intrinsics=jnp.asarray(intrinsics),
-        world_from_camera=jnp.asarray(_matrix44(world_from_camera, "world_from_camera"), jnp.float32),
+        world_from_camera=_matrix44(world_from_camera, "world_from_camera"),
     )
 
 
@@ -48,7 +49,7 @@ def front_camera(size: int) -> Camera:
     return make_camera(jnp.asarray(FRONT_WORLD_FROM_CAMERA), FRONT_FIELD_OF_VIEW, size, size)
 
 
-def project(points: Array, camera: Camera) -> tuple[Array, Array]:
+def project(points: ArrayLike, camera: Camera) -> tuple[Array, Array]:
     """World points to pixels.
 
     Args:
@@ -59,7 +60,7 @@ def project(points: Array, camera: Camera) -> tuple[Array, Array]:
         nothing where depth <= 0, behind the camera; they are finite there unless the point is in the lens itself.
     """
     rotation, translation = camera.world_from_camera[:3, :3], camera.world_from_camera[:3, 3]
-    local = jnp.einsum("...i,ij->...j", points - translation, rotation, precision=_HIGHEST)
+    local = jnp.einsum("...i,ij->...j", jnp.asarray(points) - translation, rotation, precision=_HIGHEST)
     depth = local[..., 2]
     # Far below float noise in any scene, so it changes nothing but keeps 0 / 0 out.
     safe = jnp.where(jnp.abs(depth) < 1e-9, 1e-9, depth)[..., None]
@@ -68,7 +69,7 @@ def project(points: Array, camera: Camera) -> tuple[Array, Array]:
     return pixels, depth
 
 
-def unproject(depth: Array, camera: Camera) -> Array:
+def unproject(depth: ArrayLike, camera: Camera) -> Array:
     """A depth map to the world points of its pixels.
 
     Args:
@@ -77,6 +78,7 @@ def unproject(depth: Array, camera: Camera) -> Array:
     Returns:
         float32 (H, W, 3), metres, world frame; where depth is 0 that is the camera's own position.
     """
+    depth = jnp.asarray(depth)
     height, width = depth.shape
     u = jnp.arange(width, dtype=jnp.float32)[None, :]
     v = jnp.arange(height, dtype=jnp.float32)[:, None]
@@ -95,13 +97,13 @@ def unproject_pixels(u: Array, v: Array, depth: Array, camera: Camera) -> Array:
     return jnp.einsum("ij,...j->...i", rotation, local, precision=_HIGHEST) + translation
 
 
-def resize_intrinsics(intrinsics: Array, old_size: tuple[int, int], new_size: tuple[int, int]) -> Array:
+def resize_intrinsics(intrinsics: ArrayLike, old_size: tuple[int, int], new_size: tuple[int, int]) -> Array:
     """The intrinsics (3, 3) of the same camera after its image was resized. Sizes are (height, width)."""
     scale = jnp.array([new_size[1] / old_size[1], new_size[0] / old_size[0], 1.0], jnp.float32)
-    return intrinsics * scale[:, None]
+    return jnp.asarray(intrinsics) * scale[:, None]
 
 
-def _matrix44(matrix: Array, name: str) -> Array:
+def _matrix44(matrix: ArrayLike, name: str) -> Array:
     if jnp.shape(matrix) != (4, 4):
         raise ValueError(f"{name}: expected a (4, 4) camera-to-world matrix, got shape {jnp.shape(matrix)}")
-    return jnp.asarray(matrix)
+    return jnp.asarray(matrix, jnp.float32)

@@ -6,6 +6,7 @@ Formulas: https://en.wikipedia.org/wiki/Quaternions_and_spatial_rotation.
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from dsvla_jax.types import Array
 
@@ -14,12 +15,13 @@ IDENTITY = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
 DOWN = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
 
 
-def normalize(vector: Array, epsilon: float = 1e-12) -> Array:
+def normalize(vector: ArrayLike, epsilon: float = 1e-12) -> Array:
     """Scales the last axis to unit length; a zero vector stays zero."""
+    vector = jnp.asarray(vector)
     return vector / jnp.maximum(jnp.linalg.norm(vector, axis=-1, keepdims=True), epsilon)
 
 
-def quaternion_multiply(left: Array, right: Array) -> Array:
+def quaternion_multiply(left: ArrayLike, right: ArrayLike) -> Array:
     """The rotation ``right`` followed by ``left`` (Hamilton product). (..., 4) and (..., 4) -> (..., 4)."""
     x1, y1, z1, w1 = jnp.moveaxis(jnp.asarray(left), -1, 0)
     x2, y2, z2, w2 = jnp.moveaxis(jnp.asarray(right), -1, 0)
@@ -34,12 +36,12 @@ def quaternion_multiply(left: Array, right: Array) -> Array:
     )
 
 
-def quaternion_conjugate(quaternion: Array) -> Array:
+def quaternion_conjugate(quaternion: ArrayLike) -> Array:
     """The inverse of a unit quaternion. (..., 4) -> (..., 4)."""
     return jnp.asarray(quaternion) * jnp.array([-1.0, -1.0, -1.0, 1.0], jnp.float32)
 
 
-def quaternion_rotate(quaternion: Array, vector: Array) -> Array:
+def quaternion_rotate(quaternion: ArrayLike, vector: ArrayLike) -> Array:
     """Rotates vectors (..., 3) by unit quaternions (..., 4)."""
     quaternion, vector = jnp.asarray(quaternion), jnp.asarray(vector)
     imaginary, real = quaternion[..., :3], quaternion[..., 3:]
@@ -48,7 +50,7 @@ def quaternion_rotate(quaternion: Array, vector: Array) -> Array:
     return vector + real * twice + jnp.cross(imaginary, twice)
 
 
-def quaternion_from_axis_angle(axis: Array, angle: Array) -> Array:
+def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
     """A turn by ``angle`` (...,) radians about ``axis`` (..., 3) of any non-zero length. -> (..., 4)."""
     half = 0.5 * jnp.asarray(angle)[..., None]
     axis = normalize(jnp.asarray(axis, jnp.float32))
@@ -58,7 +60,7 @@ def quaternion_from_axis_angle(axis: Array, angle: Array) -> Array:
     )
 
 
-def quaternion_to_matrix(quaternion: Array) -> Array:
+def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
     """Unit quaternions (..., 4) -> rotation matrices (..., 3, 3)."""
     x, y, z, w = jnp.moveaxis(jnp.asarray(quaternion), -1, 0)
     rows = [
@@ -69,7 +71,7 @@ def quaternion_to_matrix(quaternion: Array) -> Array:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def matrix_to_quaternion(matrix: Array) -> Array:
+def matrix_to_quaternion(matrix: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) -> canonical unit quaternions (..., 4).
 
     Of the four equivalent formulas the one that divides by the largest component is taken (Shepperd's method).
@@ -123,17 +125,17 @@ def matrix_to_quaternion(matrix: Array) -> Array:
     return canonical_quaternion(normalize(row))
 
 
-def quaternion_from_wxyz(quaternion: Array) -> Array:
+def quaternion_from_wxyz(quaternion: ArrayLike) -> Array:
     """[w, x, y, z], MuJoCo's order, to [x, y, z, w]. (..., 4) -> (..., 4)."""
     return jnp.roll(jnp.asarray(quaternion), -1, axis=-1)
 
 
-def quaternion_to_wxyz(quaternion: Array) -> Array:
+def quaternion_to_wxyz(quaternion: ArrayLike) -> Array:
     """[x, y, z, w] to [w, x, y, z], MuJoCo's order. (..., 4) -> (..., 4)."""
     return jnp.roll(jnp.asarray(quaternion), 1, axis=-1)
 
 
-def canonical_quaternion(quaternion: Array, tolerance: float = 0.0) -> Array:
+def canonical_quaternion(quaternion: ArrayLike, tolerance: float = 0.0) -> Array:
     """Of q and -q, the same rotation, the one with w >= 0. (..., 4) -> (..., 4).
 
     With w = 0 (a half turn, such as ``DOWN``) the first of x, y, z that is not zero is made positive. Components whose
@@ -147,7 +149,7 @@ def canonical_quaternion(quaternion: Array, tolerance: float = 0.0) -> Array:
     return quaternion * jnp.where(sign < 0, -1.0, 1.0)[..., None]
 
 
-def quaternion_slerp(start: Array, end: Array, fraction: Array) -> Array:
+def quaternion_slerp(start: ArrayLike, end: ArrayLike, fraction: ArrayLike) -> Array:
     """The rotation at ``fraction`` (...,) of the shorter way from ``start`` to ``end``, at constant angular speed."""
     start, end = jnp.asarray(start), jnp.asarray(end)
     dot = jnp.sum(start * end, axis=-1, keepdims=True)
@@ -164,7 +166,7 @@ def quaternion_slerp(start: Array, end: Array, fraction: Array) -> Array:
     return normalize(first * start + second * end)
 
 
-def rotation_distance(first: Array, second: Array) -> Array:
+def rotation_distance(first: ArrayLike, second: ArrayLike) -> Array:
     """The angle in radians, 0 to pi, of the turn that takes one rotation to the other. (..., 4) x 2 -> (...,)."""
     difference = quaternion_multiply(quaternion_conjugate(first), second)
     return 2.0 * jnp.arctan2(jnp.linalg.norm(difference[..., :3], axis=-1), jnp.abs(difference[..., 3]))

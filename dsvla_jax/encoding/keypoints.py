@@ -1,0 +1,58 @@
+"""The keypoint constraint in time: which object point an arm is told to go near, and its noise in training.
+
+An arm has K keypoints in the order the instruction names them. The active one is the first it has not yet come within
+5 cm of; it never goes back, and the last one stays active for good. Arms with fewer than K keypoints repeat their last.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from dsvla_jax.types import Array
+
+REACHED_RADIUS = 0.05
+
+
+def active_keypoint(latched_count: ArrayLike, keypoints: ArrayLike, count: ArrayLike | None = None) -> Array:
+    """The keypoint an arm is heading for.
+
+    Args:
+        latched_count: int (), how many keypoints it has reached.
+        keypoints: float (K, 3), metres, world frame.
+        count: int (), how many of the K are real; all when None.
+
+    Returns:
+        float (3,).
+    """
+    keypoints = jnp.asarray(keypoints)
+    last = (keypoints.shape[0] if count is None else jnp.asarray(count)) - 1
+    return keypoints[jnp.clip(jnp.asarray(latched_count), 0, last)]
+
+
+def advance_latch(
+    latched: ArrayLike, end_effector: ArrayLike, keypoints: ArrayLike, radius: float = REACHED_RADIUS
+) -> Array:
+    """Counts the keypoints reached, given where the arms are now.
+
+    Only the active keypoint can be reached, so they are reached in order; one look may pass several when they lie
+    within ``radius`` of the arm together.
+
+    Args:
+        latched: int32 (A,), the count so far, 0 to K.
+        end_effector: float (A, 3). keypoints: float (A, K, 3). Metres, world frame.
+
+    Returns:
+        int32 (A,), at least ``latched``.
+    """
+    keypoints = jnp.asarray(keypoints)
+    distance = jnp.linalg.norm(keypoints - jnp.asarray(end_effector)[:, None, :], axis=-1)
+    reached = (distance < radius) | (jnp.arange(keypoints.shape[1]) < jnp.asarray(latched)[:, None])
+    return jnp.sum(jnp.cumprod(reached.astype(jnp.int32), axis=1), axis=1, dtype=jnp.int32)
+
+
+def perturb_keypoints(key: Array, keypoints: ArrayLike, max_offset: float = 0.03, probability: float = 0.5) -> Array:
+    """Training noise: with ``probability`` a sample's keypoints (..., 3) move by up to ``max_offset`` m an axis."""
+    keypoints = jnp.asarray(keypoints)
+    choice_key, offset_key = jax.random.split(key)
+    offsets = jax.random.uniform(offset_key, keypoints.shape, keypoints.dtype, -max_offset, max_offset)
+    return jnp.where(jax.random.bernoulli(choice_key, probability), keypoints + offsets, keypoints)
