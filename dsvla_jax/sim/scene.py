@@ -1,0 +1,167 @@
+"""One task's MuJoCo model: the table, the arms, the task's bodies, and where all of them are in the state's arrays."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from dsvla_jax.geometry import rotations
+from dsvla_jax.sim import robot
+from dsvla_jax.sim.tasks import Placement, StateLayout, StateView, Task
+from dsvla_jax.types import TABLE_HEIGHT, Array
+
+TABLE_RGBA = (0.62, 0.47, 0.34, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class GraspableBody:
+    """A loose object that a closing gripper is welded to.
+
+    body: body id. qpos: address of its free joint. half_extents: float32 (3,), metres, in its frame.
+    welds: int (A,), the equality constraint to each arm's hand. They begin inactive; their anchor and relative pose
+        (eq_data) are written when the object is grasped.
+    """
+
+    body: int
+    qpos: int
+    half_extents: np.ndarray
+    welds: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled task.
+
+    arms: the left arm first; a single arm is called left. graspables: in the task's order.
+    initial: qpos (nq,), ctrl (nu,), mocap_pos (nmocap, 3), mocap_quat (nmocap, 4) wxyz and geom_rgba (ngeom, 4), all
+        float32: the arms at their start, the task's bodies where they were built.
+    """
+
+    task: Task
+    mj_model: mujoco.MjModel
+    layout: StateLayout
+    arms: tuple[robot.Arm, ...]
+    graspables: tuple[GraspableBody, ...]
+    initial: "SceneState"
+
+    def view(self, qpos: Array, mocap_pos: Array, mocap_quat: Array) -> StateView:
+        """What the task's functions read: qpos (nq,), mocap_pos (nmocap, 3), mocap_quat (nmocap, 4) of one example."""
+        return StateView(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat, layout=self.layout)
+
+    def place(self, placement: Placement) -> "SceneState":
+        """The state in which an episode begins. Pure; vmap it over placements."""
+        state, layout = self.initial, self.layout
+        qpos, pos, quat, rgba = (
+            jnp.asarray(a) for a in (state.qpos, state.mocap_pos, state.mocap_quat, state.geom_rgba)
+        )
+        for name, pose in placement.mocap.items():
+            index = layout.address("mocap", name)
+            pos = pos.at[index].set(pose[:3])
+            quat = quat.at[index].set(rotations.quaternion_to_wxyz(pose[3:]))
+        for name, pose in placement.free.items():
+            address = layout.address("free", name)
+            wxyz = rotations.quaternion_to_wxyz(pose[3:])
+            qpos = qpos.at[address : address + 7].set(jnp.concatenate([pose[:3], wxyz]))
+        for name, value in placement.joints.items():
+            qpos = qpos.at[layout.address("joints", name)].set(value)
+        for name, colour in placement.rgba.items():
+            rgba = rgba.at[self.mj_model.geom(name).id].set(colour)
+        return SceneState(qpos=qpos, ctrl=jnp.asarray(state.ctrl), mocap_pos=pos, mocap_quat=quat, geom_rgba=rgba)
+
+
+@struct.dataclass
+class SceneState:
+    """What a placement decides; see `Scene.initial` for the shapes."""
+
+    qpos: Array
+    ctrl: Array
+    mocap_pos: Array
+    mocap_quat: Array
+    geom_rgba: Array
+
+
+def build_scene(task: Task) -> Scene:
+    """Compiles the model of a task."""
+    spec = mujoco.MjSpec()
+    robot.set_physics_options(spec)
+    spec.worldbody.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=[0, 0, TABLE_HEIGHT],
+        size=[2.0, 2.0, 0.1],
+        rgba=list(TABLE_RGBA),
+        contype=robot.TABLE.contype,
+        conaffinity=robot.TABLE.conaffinity,
+    )
+    bases = {1: (robot.SINGLE_BASE,), 2: robot.DUAL_BASES}.get(task.num_arms)
+    if bases is None:
+        raise ValueError(f"task {task.name!r}: num_arms is {task.num_arms}, expected 1 or 2")
+    prefixes = robot.ARM_PREFIXES[: task.num_arms]
+    for prefix, base in zip(prefixes, bases, strict=True):
+        robot.add_panda(spec, prefix, base)
+    task.build(spec)
+    for graspable in task.graspables:
+        for prefix in prefixes:
+            _add_weld(spec, f"{prefix}hand", graspable.body)
+    model = spec.compile()
+
+    arms = tuple(robot.find_arm(model, prefix) for prefix in prefixes)
+    layout = _layout(model, prefixes)
+    return Scene(
+        task=task,
+        mj_model=model,
+        layout=layout,
+        arms=arms,
+        graspables=tuple(
+            GraspableBody(
+                body=model.body(g.body).id,
+                qpos=layout.address("free", g.body),
+                half_extents=np.asarray(g.half_extents, np.float32),
+                welds=np.array([model.equality(_weld_name(f"{prefix}hand", g.body)).id for prefix in prefixes]),
+            )
+            for g in task.graspables
+        ),
+        initial=_initial_state(model, arms),
+    )
+
+
+def _weld_name(hand: str, body: str) -> str:
+    return f"{hand}_holds_{body}"
+
+
+def _add_weld(spec: mujoco.MjSpec, hand: str, body: str) -> None:
+    weld = spec.add_equality(
+        name=_weld_name(hand, body),
+        type=mujoco.mjtEq.mjEQ_WELD,
+        name1=hand,
+        name2=body,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        active=False,
+    )
+    # anchor (3), relative position (3), relative quaternion wxyz (4), torque scale
+    weld.data[:11] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]
+    weld.solref = [0.01, 1.0]
+
+
+def _layout(model: mujoco.MjModel, arm_prefixes: tuple[str, ...]) -> StateLayout:
+    free, joints = {}, {}
+    for i in range(model.njnt):
+        joint = model.joint(i)
+        if joint.type[0] == mujoco.mjtJoint.mjJNT_FREE:
+            free[model.body(joint.bodyid[0]).name] = int(joint.qposadr[0])
+        elif not joint.name.startswith(arm_prefixes):
+            joints[joint.name] = int(joint.qposadr[0])
+    bodies = (model.body(i) for i in range(model.nbody))
+    mocap = {body.name: int(body.mocapid[0]) for body in bodies if body.mocapid[0] >= 0}
+    return StateLayout(free=free, mocap=mocap, joints=joints)
+
+
+def _initial_state(model: mujoco.MjModel, arms: tuple[robot.Arm, ...]) -> SceneState:
+    data = mujoco.MjData(model)
+    qpos, ctrl = model.qpos0.astype(np.float32), np.zeros(model.nu, np.float32)
+    for arm in arms:
+        robot.set_start(arm, qpos, ctrl)
+    pos, quat, rgba = (np.array(a, np.float32) for a in (data.mocap_pos, data.mocap_quat, model.geom_rgba))
+    return SceneState(qpos=qpos, ctrl=ctrl, mocap_pos=pos, mocap_quat=quat, geom_rgba=rgba)
