@@ -53,9 +53,7 @@ class Scene:
     def place(self, placement: Placement) -> "SceneState":
         """The state in which an episode begins. Pure; vmap it over placements."""
         state, layout = self.initial, self.layout
-        qpos, pos, quat, rgba = (
-            jnp.asarray(a) for a in (state.qpos, state.mocap_pos, state.mocap_quat, state.geom_rgba)
-        )
+        qpos, pos, quat, rgba = state.qpos, state.mocap_pos, state.mocap_quat, state.geom_rgba
         for name, pose in placement.mocap.items():
             index = layout.address("mocap", name)
             pos = pos.at[index].set(pose[:3])
@@ -68,7 +66,7 @@ class Scene:
             qpos = qpos.at[layout.address("joints", name)].set(value)
         for name, colour in placement.rgba.items():
             rgba = rgba.at[self.mj_model.geom(name).id].set(colour)
-        return SceneState(qpos=qpos, ctrl=jnp.asarray(state.ctrl), mocap_pos=pos, mocap_quat=quat, geom_rgba=rgba)
+        return SceneState(qpos=qpos, ctrl=state.ctrl, mocap_pos=pos, mocap_quat=quat, geom_rgba=rgba)
 
 
 @struct.dataclass
@@ -163,5 +161,5 @@ def _initial_state(model: mujoco.MjModel, arms: tuple[robot.Arm, ...]) -> SceneS
     qpos, ctrl = model.qpos0.astype(np.float32), np.zeros(model.nu, np.float32)
     for arm in arms:
         robot.set_start(arm, qpos, ctrl)
-    pos, quat, rgba = (np.array(a, np.float32) for a in (data.mocap_pos, data.mocap_quat, model.geom_rgba))
-    return SceneState(qpos=qpos, ctrl=ctrl, mocap_pos=pos, mocap_quat=quat, geom_rgba=rgba)
+    arrays = (qpos, ctrl, data.mocap_pos, data.mocap_quat, model.geom_rgba)
+    return SceneState(*(jnp.asarray(array, jnp.float32) for array in arrays))

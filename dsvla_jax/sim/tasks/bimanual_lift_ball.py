@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 
-from dsvla_jax.geometry import rotations
 from dsvla_jax.sim.robot import OBJECT
 from dsvla_jax.sim.tasks import task
 from dsvla_jax.types import TABLE_HEIGHT, Action, Array
@@ -11,7 +10,7 @@ from dsvla_jax.types import TABLE_HEIGHT, Action, Array
 RADIUS = 0.1
 LIFTED = 0.95  # height of the ball's centre, metres
 # Straight down and turned by a quarter, so that an open gripper meets the ball with the sides of both its fingers.
-SIDEWAYS = (0.70710678, 0.70710678, 0.0, 0.0)
+SIDEWAYS = (0.70710678, -0.70710678, 0.0, 0.0)
 # The key poses of each arm: distance from the ball's centre along y, and height over it.
 KEYFRAMES = ((0.22, -0.01), (0.15, -0.01), (0.08, -0.01), (0.08, 0.24))
 

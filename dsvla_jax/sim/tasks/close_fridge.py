@@ -26,22 +26,15 @@ def _build(spec) -> None:
     silver, inside, dark = [0.75, 0.77, 0.8, 1], [0.93, 0.95, 0.97, 1], [0.2, 0.2, 0.22, 1]
     x, y, wall, middle = WIDTH / 2, DEPTH / 2 + THICKNESS, 0.006, (HEIGHT + SPLIT) / 2
     upper = (HEIGHT - SPLIT) / 2
-    task.add_part(
-        root, "fridge_lower", task.BOX, [x, DEPTH / 2, SPLIT / 2], [x, y, SPLIT / 2], silver, FIXTURE
-    )
-    task.add_part(
-        root, "fridge_top", task.BOX, [x, DEPTH / 2, wall], [x, y, HEIGHT - wall], silver, FIXTURE
-    )
+    task.add_part(root, "fridge_lower", task.BOX, [x, DEPTH / 2, SPLIT / 2], [x, y, SPLIT / 2], silver, FIXTURE)
+    task.add_part(root, "fridge_top", task.BOX, [x, DEPTH / 2, wall], [x, y, HEIGHT - wall], silver, FIXTURE)
     for i, side in enumerate((wall, WIDTH - wall)):
         task.add_part(root, f"fridge_side{i}", task.BOX, [wall, DEPTH / 2, upper], [side, y, middle], silver)
     task.add_part(root, "fridge_back", task.BOX, [x, wall, upper], [x, THICKNESS + DEPTH - wall, middle], inside)
     task.add_part(root, "fridge_shelf", task.BOX, [x, DEPTH / 2 - 0.01, 0.003], [x, y, middle], inside)
     task.add_part(root, "fridge_bottle", task.CYLINDER, [0.02, 0.035], [x, y, SPLIT + 0.035], [0.2, 0.6, 0.25, 1])
     task.add_part(root, "fridge_lower_door", task.BOX, [x, THICKNESS, SPLIT / 2 - 0.004], [x, 0, SPLIT / 2], silver)
-    bar = {"quat": [1.0, 0.0, 0.0, 0.0]}
-    task.add_part(
-        root, "fridge_lower_handle", task.CAPSULE, [0.008, 0.04], [HANDLE, -0.025, SPLIT - 0.07], dark, **bar
-    )
+    task.add_part(root, "fridge_lower_handle", task.CAPSULE, [0.008, 0.04], [HANDLE, -0.025, SPLIT - 0.07], dark)
 
     door = root.add_body(name="fridge_door", pos=[0, 0, middle])
     joint = door.add_joint(name="fridge_door", type=task.HINGE, axis=[0, 0, -1], range=[0.0, 1.4], limited=True)
@@ -50,7 +43,7 @@ def _build(spec) -> None:
     task.add_part(door, "fridge_door", task.BOX, size, [x, 0, 0], silver, FIXTURE, mass=0.5)
     task.add_part(door, "fridge_door_lining", task.BOX, [x - 0.015, 0.004, upper - 0.02], [x, 0.01, 0], inside)
     task.add_part(door, "fridge_door_rack", task.BOX, [x - 0.03, 0.015, 0.012], [x, 0.025, -0.04], [0.4, 0.6, 0.8, 1])
-    task.add_part(door, "fridge_door_handle", task.CAPSULE, [0.008, 0.04], [HANDLE, -0.025, -0.02], dark, **bar)
+    task.add_part(door, "fridge_door_handle", task.CAPSULE, [0.008, 0.04], [HANDLE, -0.025, -0.02], dark)
 
 
 def _sample(key: Array) -> task.Placement:

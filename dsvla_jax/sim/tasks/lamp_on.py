@@ -30,9 +30,7 @@ def _build(spec) -> None:
     joint.stiffness[0], joint.damping[0] = 200.0, 5.0
     # An upright capsule whose dome is the button.
     green = [0.1, 0.75, 0.2, 1]
-    task.add_part(
-        button, "lamp_button", task.CAPSULE, [0.024, 0.003], [0, 0, -0.027], green, FIXTURE, mass=0.05
-    )
+    task.add_part(button, "lamp_button", task.CAPSULE, [0.024, 0.003], [0, 0, -0.027], green, FIXTURE, mass=0.05)
 
 
 def _sample(key: Array) -> task.Placement:

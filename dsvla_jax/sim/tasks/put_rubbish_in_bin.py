@@ -36,10 +36,11 @@ def _build(spec) -> None:
         creased = [shade, shade, shade, 1]
         task.add_part(rubbish, f"rubbish_crease{i}", task.BOX, [0.0175] * 3, [0, 0, 0.001], creased, quat=quat)
 
+    red = [0.8, 0.12, 0.08, 1]
     for name in OBJECTS[1:]:
         # The damping stops a tomato from rolling away.
         tomato = task.add_object(spec, name, TOMATO, damping=1e-3)
-        task.add_part(tomato, name, task.SPHERE, [TOMATO], [0, 0, 0], [0.8, 0.12, 0.08, 1], OBJECT_AND_FIXTURE, mass=0.05)
+        task.add_part(tomato, name, task.SPHERE, [TOMATO], [0, 0, 0], red, OBJECT_AND_FIXTURE, mass=0.05)
         task.add_part(tomato, f"{name}_stem", task.CAPSULE, [0.005, 0.004], [0, 0, TOMATO], [0.15, 0.5, 0.1, 1])
 
 
