@@ -16,7 +16,7 @@ import tyro
 from tqdm import tqdm
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.encoding.keypoints import active_keypoints, advance_latch
+from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.policy import Policy, load_policy
 from dsvla_jax.report import EpisodeResult, print_table, read_results, write_report, write_results
@@ -101,7 +101,7 @@ def evaluate_task(
         for _ in range(limit):
             observation = environment.observe(state)
             latched = np.asarray(jax.vmap(advance_latch)(latched, observation.pose[..., :3], keypoints))
-            active = np.asarray(jax.vmap(active_keypoints)(latched, keypoints)) if policy.config.encoding.use_keypoints else None
+            active = np.asarray(jax.vmap(jax.vmap(active_keypoint))(latched, keypoints)) if policy.config.encoding.use_keypoints else None
             action, answers = policy.act(observation, instructions, active)
             rgb = np.asarray(observation.rgb)
             for i in np.flatnonzero(~success):

@@ -21,7 +21,7 @@ from configs import config_names, get_config
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.loader import make_loader
-from data_pipelines.samples import build_vocabulary, make_sampler
+from data_pipelines.samples import make_sampler, suite_tokenizer
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.model.variables import split_variables
@@ -54,17 +54,16 @@ def main(
         perturb=data.perturb,
     )
     reader = EpisodeReader(Path(data.folder), tasks=data.tasks, episodes=data.episodes)
-    tokenizer = build_vocabulary(data.tasks, experiment.encoding, experiment.model.language.vocab_size)
-    loader = make_loader(
-        reader, make_sampler(experiment, tokenizer), batch_size=experiment.batch_size, seed=experiment.seed
-    )
+    tokenizer = suite_tokenizer()
+    sample = make_sampler(data, experiment.encoding, tokenizer)
+    loader = make_loader(reader, sample, batch_size=experiment.batch_size, seed=experiment.seed)
 
     model = VLA(experiment.model)
     variables = initial_variables(experiment, tokenizer.number_values)
     trainable, frozen = split_variables(variables, experiment.regime)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
-    report_size(trainable, frozen, len(reader))
+    report_size(trainable, frozen, reader.num_frames)
 
     checkpoints = RunCheckpoints(run)
     if checkpoints.latest_step is not None:

@@ -23,7 +23,7 @@ def config() -> Experiment:
         ),
         model=ModelConfig(
             vision=VisionConfig(image_size=96, patch_size=16, width=WIDTH, layers=3, heads=4),
-            language=LanguageConfig(vocab_size=suite_tokenizer().vocab_size, width=WIDTH, layers=3, heads=4, ffn=352),
+            language=LanguageConfig(vocab_size=suite_tokenizer().vocab_size, width=WIDTH, layers=3, heads=4, kv_heads=4, ffn=352),
         ),
         data=DataConfig(
             episodes=150,

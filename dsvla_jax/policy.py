@@ -15,7 +15,7 @@ from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
 from dsvla_jax.encoding.prompts import parse_answer
-from dsvla_jax.encoding.text import AnswerGrammar, WordTokenizer, build_answer_grammar
+from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import decode_actions
 from dsvla_jax.model.variables import Variables
@@ -31,18 +31,19 @@ class PolicyConfig:
     model: ModelConfig
 
 
-@partial(jax.jit, static_argnames=("config",))
+@partial(jax.jit, static_argnames=("config", "tokenizer"))
 def _decode(
     config: PolicyConfig,
+    tokenizer: WordTokenizer,
     variables: Variables,
     observation: Observation,
     text_tokens: Array,
     text_mask: Array,
-    grammar: AnswerGrammar,
-) -> tuple[Array, Array]:
+) -> Array:
     picture = encode_observation(observation, config.encoding)
     inputs = ModelInputs(**picture, text_tokens=text_tokens, text_mask=text_mask)
-    return decode_actions(VLA(config.model), variables, inputs, grammar)
+    grammar = build_answer_grammar(tokenizer, observation.pose.shape[1], config.encoding.style)
+    return decode_actions(VLA(config.model), variables, inputs, grammar)[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,8 +76,7 @@ class Policy:
         ]
         encoded = [encode_text(self.tokenizer, prompt, None, encoding.max_text)[:2] for prompt in prompts]
         tokens, masks = (np.stack(column) for column in zip(*encoded, strict=True))
-        grammar = build_answer_grammar(self.tokenizer, arms, encoding.style)
-        answers, _ = _decode(self.config, self.variables, observation, tokens, masks, grammar)
+        answers = _decode(self.config, self.tokenizer, self.variables, observation, tokens, masks)
         texts = [self.tokenizer.decode([int(token) for token in row]) for row in np.asarray(answers)]
         bins = np.stack([parse_answer(text, arms, encoding.style) for text in texts])
         return jax.vmap(self.codec.decode)(jnp.asarray(bins)), texts

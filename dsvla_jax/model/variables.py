@@ -4,7 +4,7 @@ from typing import Any
 
 from flax import traverse_util
 
-PROJECTION = "projection"
+PROJECTION = "projector"
 
 Variables = dict[str, Any]
 

@@ -1,0 +1,80 @@
+"""From a recorded frame to one training sample: augmentation, prompt and answer, tokens.
+
+The sample is a flat dict of arrays of fixed shape, in which one- and two-armed robots look alike:
+
+    rgb uint8 (H, W, 3), depth float32 (H, W), intrinsics float32 (3, 3), world_from_camera float32 (4, 4),
+    text_tokens int32 (T,), text_mask bool (T,), answer_mask bool (T,), soft_mask bool (T,).
+
+`answer_mask` is True on the tokens to learn; `soft_mask` on those of them that name a bin of position or rotation.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from data_pipelines.augment import jitter_state, perturb_keypoint, random_offset, shift_world, vary_colour
+from data_pipelines.episodes import Frame
+from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
+from dsvla_jax.encoding.prompts import format_answer
+from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar, vocabulary
+from dsvla_jax.sim.tasks import TASKS
+from dsvla_jax.training.experiment import DataConfig
+
+Sample = dict[str, np.ndarray]
+
+
+@cache
+def suite_tokenizer() -> WordTokenizer:
+    """The word-level vocabulary of every instruction of the task suite."""
+    return WordTokenizer(vocabulary(text for task in TASKS.values() for text in task.instructions))
+
+
+def make_sampler(
+    data: DataConfig, encoding: EncodingConfig, tokenizer: WordTokenizer
+) -> Callable[[Frame, np.random.Generator], Sample]:
+    """``sample(frame, rng)``: varies the frame as `data` says and writes its prompt and answer."""
+    soft_slots = {arms: _soft_slots(tokenizer, arms, encoding.style) for arms in (1, 2)}
+    codec = encoding.codec
+
+    def sample(frame: Frame, rng: np.random.Generator) -> Sample:
+        if data.shift_world > 0:
+            # Horizontal only: the table, and with it the crop of the cloud, keeps its height.
+            frame = shift_world(frame, random_offset(rng, (data.shift_world, data.shift_world, 0.0)))
+        if data.colour_variation > 0:
+            frame = vary_colour(frame, rng, data.colour_variation)
+        if data.state_jitter > 0:
+            frame = jitter_state(frame, rng, data.state_jitter, 0.5)
+        if data.keypoint_noise > 0:
+            frame = perturb_keypoint(frame, rng, data.keypoint_noise, data.keypoint_noise_probability)
+        prompt = build_prompt(
+            encoding,
+            frame["instruction"],
+            frame["pose"],
+            frame["gripper_open"],
+            frame["keypoint"] if encoding.use_keypoints else None,
+        )
+        bins = np.asarray(codec.encode(frame["target_pose"], frame["target_gripper"]))
+        answer = format_answer(bins, encoding.style)
+        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text)
+        soft_mask = np.zeros_like(answer_mask)
+        soft_mask[answer_mask] = soft_slots[len(bins)]
+        return {
+            "rgb": frame["rgb"],
+            "depth": frame["depth"],
+            "intrinsics": frame["intrinsics"],
+            "world_from_camera": frame["world_from_camera"],
+            "text_tokens": tokens,
+            "text_mask": mask,
+            "answer_mask": answer_mask,
+            "soft_mask": soft_mask,
+        }
+
+    return sample
+
+
+def _soft_slots(tokenizer: WordTokenizer, arms: int, style: str) -> np.ndarray:
+    """bool (L,): which answer tokens name a bin, of which the neighbours are nearly right too."""
+    grammar = build_answer_grammar(tokenizer, arms, style)
+    # A gripper status is a free slot as well, but of two values only.
+    return (np.asarray(grammar.forced) < 0) & (np.asarray(grammar.allowed).sum(-1) > 2)

@@ -1,0 +1,176 @@
+"""The objective, the two regimes and checkpoints, on models small enough to train in a second."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
+from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
+from dsvla_jax.model.variables import join_variables, split_variables
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
+from dsvla_jax.training.objective import answer_loss, target_distributions
+from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+
+VOCABULARY = 40
+
+
+def small_experiment(**changes) -> Experiment:
+    return Experiment(
+        encoding=EncodingConfig(
+            image_size=32,
+            patch_size=16,
+            points=PointTokenizerConfig(num_points=32, group_sizes=(16, 8, 4), neighbours=4, width=4),
+            style="compact",
+            max_text=16,
+        ),
+        model=ModelConfig(
+            vision=VisionConfig(image_size=32, patch_size=16, width=32, layers=1, heads=2),
+            language=LanguageConfig(vocab_size=VOCABULARY, width=32, layers=2, heads=2, kv_heads=2, ffn=64),
+            lora=LoraConfig(rank=2),
+        ),
+        steps=10,
+        batch_size=4,
+        **changes,
+    )
+
+
+def random_batch(experiment: Experiment) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    size, image, text = experiment.batch_size, 32, experiment.encoding.max_text
+    camera = np.eye(4, dtype=np.float32)
+    intrinsics = np.array([[-40, 0, 16], [0, -40, 16], [0, 0, 1]], np.float32)
+    answer = np.zeros((size, text), bool)
+    answer[:, 8:12] = True
+    return {
+        "rgb": rng.integers(0, 255, (size, image, image, 3), np.uint8),
+        "depth": rng.uniform(0.8, 1.2, (size, image, image)).astype(np.float32),
+        "intrinsics": np.broadcast_to(intrinsics, (size, 3, 3)),
+        "world_from_camera": np.broadcast_to(camera, (size, 4, 4)),
+        "text_tokens": rng.integers(4, VOCABULARY, (size, text)).astype(np.int32),
+        "text_mask": np.ones((size, text), bool),
+        "answer_mask": answer,
+        "soft_mask": np.zeros((size, text), bool),
+    }
+
+
+def train(experiment: Experiment, steps: int):
+    variables = initialize(experiment.model, jax.random.key(0))
+    trainable, frozen = split_variables(variables, experiment.regime)
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    values = np.full(VOCABULARY, np.nan, np.float32)
+    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, values))
+    losses = []
+    for _ in range(steps):
+        state, metrics = step(state, frozen, random_batch(experiment))
+        losses.append(float(metrics["loss"]))
+    return variables, state, frozen, losses
+
+
+def test_lora_regime_changes_adapters_and_projection_and_nothing_else():
+    experiment = small_experiment(regime="lora")
+    before, state, frozen, losses = train(experiment, 6)
+    after = join_variables(state.trainable, frozen)
+    changed = {
+        path[0].key if path[0].key == "lora" else path[1].key
+        for (path, old), new in zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
+        if not np.array_equal(old, new)
+    }
+    assert changed == {"lora", "projector"}
+    assert losses[-1] < losses[0]
+
+
+def test_full_regime_fits_a_batch():
+    _, _, _, losses = train(dataclasses.replace(small_experiment(), steps=60), 60)
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_only_answer_tokens_are_learned():
+    rng = np.random.default_rng(0)
+    logits = jnp.asarray(rng.normal(size=(2, 6, 10)), jnp.float32)
+    tokens = jnp.asarray(rng.integers(0, 10, (2, 6)))
+    answer = jnp.zeros((2, 6), bool).at[:, 4:].set(True)
+    targets = jnp.eye(10)
+
+    def loss(logits):
+        return answer_loss(logits, tokens, answer, jnp.zeros_like(answer), targets)[0]
+
+    gradient = np.abs(np.asarray(jax.grad(loss)(logits))).sum(-1)
+    assert (gradient[:, 3:5] > 0).all(), "positions 3 and 4 predict the answer tokens 4 and 5"
+    assert (gradient[:, [0, 1, 2, 5]] == 0).all()
+    probabilities = np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)
+    expected = -np.mean([np.log(probabilities[b, t - 1, tokens[b, t]]) for b in range(2) for t in (4, 5)])
+    np.testing.assert_allclose(loss(logits), expected, rtol=1e-5)
+
+
+def test_soft_targets_spread_over_neighbouring_integers_only():
+    values = np.array([np.nan, np.nan, *range(-3, 4)], np.float32)
+    targets = target_distributions(values, 1.0)
+    np.testing.assert_allclose(targets.sum(1), 1, rtol=1e-6)
+    assert targets[5].argmax() == 5
+    np.testing.assert_allclose(targets[5, 6] / targets[5, 5], np.exp(-0.5), rtol=1e-6)
+    assert (targets[5, :2] == 0).all()
+    np.testing.assert_array_equal(targets[0], np.eye(9)[0])
+    np.testing.assert_array_equal(target_distributions(values, 0.0), np.eye(9))
+
+
+def test_checkpoint_resumes_training_exactly(tmp_path: Path):
+    experiment = small_experiment()
+    _, state, _, _ = train(experiment, 3)
+    checkpoints = RunCheckpoints(tmp_path)
+    checkpoints.save(3, state.trainable, state.optimizer, {"position": 7})
+    checkpoints.close()
+    checkpoints = RunCheckpoints(tmp_path)
+    restored = checkpoints.restore(state.trainable, state.optimizer)
+    checkpoints.close()
+    assert (restored.step, restored.iterator) == (3, {"position": 7})
+    for saved, loaded in zip(
+        jax.tree.leaves((state.trainable, state.optimizer)),
+        jax.tree.leaves((restored.trainable, restored.optimizer)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(saved, loaded)
+
+
+def test_lora_checkpoint_holds_the_base_once_and_gives_all_variables(tmp_path: Path):
+    experiment = small_experiment(regime="lora")
+    variables, state, frozen, _ = train(experiment, 2)
+    checkpoints = RunCheckpoints(tmp_path)
+    checkpoints.save_base(frozen)
+    checkpoints.save(2, state.trainable, state.optimizer, {})
+    loaded = checkpoints.restore_variables(jax.eval_shape(lambda: variables))
+    checkpoints.close()
+    expected = join_variables(state.trainable, frozen)
+    assert jax.tree.structure(loaded) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, loaded, expected)
+
+
+def test_a_checkpoint_of_another_size_is_refused_by_name(tmp_path: Path):
+    experiment = small_experiment()
+    _, state, _, _ = train(experiment, 1)
+    checkpoints = RunCheckpoints(tmp_path)
+    checkpoints.save(1, state.trainable, state.optimizer, {})
+    wider = dataclasses.replace(experiment.model, language=dataclasses.replace(experiment.model.language, width=64))
+    other = jax.eval_shape(lambda: initialize(wider, jax.random.key(0)))
+    with pytest.raises(CheckpointError, match=r"another model: .*expected .*found"):
+        checkpoints.restore(other)
+    checkpoints.close()
+
+
+def test_an_empty_run_says_how_to_train(tmp_path: Path):
+    checkpoints = RunCheckpoints(tmp_path)
+    with pytest.raises(CheckpointError, match="no complete checkpoint; train first"):
+        checkpoints.restore({})
+
+
+def test_experiment_survives_json(tmp_path: Path):
+    experiment = small_experiment(regime="lora")
+    save_experiment(tmp_path / "config.json", experiment)
+    assert load_experiment(tmp_path / "config.json") == experiment
