@@ -5,9 +5,10 @@
     run(state, controls, success_fn=None, eq_active=None) -> state
 
 that applies float32 controls (B, S, nu), one row a physics step, to every episode of the batch, and latches
-``state.succeeded`` wherever ``success_fn`` holds after some step. ``success_fn`` is per example and takes the state with
-the step's qpos; of the physical fields only qpos and what does not change within a run (mocap poses, params) may be
-read by it. ``eq_active`` bool (B, S, neq) switches equality constraints step by step; the last row stays in the state.
+``state.succeeded`` wherever ``success_fn`` holds after some step. ``success_fn`` is per example and takes the state
+with the step's qpos; of the physical fields only qpos and what does not change within a run (mocap poses, params) may
+be read by it. ``eq_active`` bool (B, S, neq) switches equality constraints step by step; the last row stays in the
+state.
 """
 
 import copy
@@ -137,7 +138,9 @@ class MujocoStepper:
         inputs = np.concatenate([np.asarray(controls, np.float64), np.asarray(eq_active, np.float64)], axis=-1)
         start = np.concatenate([np.zeros((batch, 1)), np.asarray(state.qpos), np.asarray(state.qvel)], axis=1)
         if model.na or model.npluginstate:
-            raise ValueError("the model has actuator activations or plugins, which SimState does not carry; remove them")
+            raise ValueError(
+                "the model has actuator activations or plugins, which SimState does not carry: remove them"
+            )
         history, _ = self._pool.rollout(self._models[:batch], self._data, start, inputs, control_spec=spec)
 
         # MuJoCo resets an episode that diverges, and its clock with it.
@@ -148,9 +151,7 @@ class MujocoStepper:
         succeeded = np.asarray(state.succeeded)
         if success_fn is not None:
             if success_fn not in self._predicates:
-                self._predicates[success_fn] = jax.jit(
-                    lambda state, qpos: success_over_steps(success_fn, state, qpos)
-                )
+                self._predicates[success_fn] = jax.jit(lambda state, qpos: success_over_steps(success_fn, state, qpos))
             succeeded = succeeded | (np.asarray(self._predicates[success_fn](state, qpos)) & ok)
         state = state.replace(
             qpos=qpos[:, -1],
@@ -179,3 +180,80 @@ class MujocoStepper:
 def mujoco_stepper(model: mujoco.MjModel, threads: int | None = None) -> MujocoStepper:
     """The C stepper of ``model``; see the module's words for the signature."""
     return MujocoStepper(model, threads)
+
+
+class MjxStepper:
+    """MJX: pure and jittable. ``mjx_model`` may be passed in as an argument of the enclosing jit, so that the model is
+    not baked into the program as constants."""
+
+    def __init__(self, model: mujoco.MjModel):
+        from mujoco import mjx
+
+        self._mjx = mjx
+        self.mjx_model = mjx.put_model(model, impl="jax")
+        self._template = mjx.make_data(model, impl="jax")
+
+    def __call__(
+        self,
+        state: SimState,
+        controls: Array,
+        success_fn: SuccessFn | None = None,
+        eq_active: Array | None = None,
+        mjx_model: Any = None,
+    ) -> SimState:
+        model = self.mjx_model if mjx_model is None else mjx_model
+        steps = controls.shape[1]
+        if eq_active is None:
+            eq_active = jnp.broadcast_to(
+                jnp.asarray(state.eq_active)[:, None], (controls.shape[0], steps, state.eq_active.shape[-1])
+            )
+        return jax.vmap(lambda s, c, e: self._run_one(model, s, c, e, success_fn))(state, controls, eq_active)
+
+    def _run_one(
+        self, model: Any, state: SimState, controls: Array, eq_active: Array, success_fn: SuccessFn | None
+    ) -> SimState:
+        model = model.replace(eq_data=state.eq_data)
+        active_dtype = self._template.eq_active.dtype
+        data = self._data(state)
+
+        def step(carry: tuple[Any, Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Any, Array, Array], None]:
+            data, succeeded, finite = carry
+            control, active = inputs
+            data = self._mjx.step(model, data.replace(ctrl=control, eq_active=active.astype(active_dtype)))
+            finite = finite & jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
+            if success_fn is not None:
+                succeeded = succeeded | (finite & success_fn(state.replace(qpos=data.qpos)))
+            return (data, succeeded, finite), None
+
+        carry = (data, jnp.asarray(state.succeeded), jnp.array(True))
+        (data, succeeded, finite), _ = jax.lax.scan(step, carry, (controls, eq_active))
+        state = state.replace(
+            qpos=jnp.where(finite, data.qpos, state.qpos),
+            qvel=jnp.where(finite, data.qvel, state.qvel),
+            ctrl=controls[-1],
+            eq_active=eq_active[-1],
+            succeeded=jnp.where(finite, succeeded, state.succeeded),
+            diverged=state.diverged | ~finite,
+        )
+        return self._with_geometry(model, state)
+
+    def update_geometry(self, state: SimState) -> SimState:
+        """Sets geom_xpos and geom_xmat from qpos and the mocap poses."""
+        return jax.vmap(lambda s: self._with_geometry(self.mjx_model, s))(state)
+
+    def _with_geometry(self, model: Any, state: SimState) -> SimState:
+        data = self._mjx.kinematics(model, self._data(state))
+        return state.replace(geom_xpos=data.geom_xpos, geom_xmat=data.geom_xmat)
+
+    def _data(self, state: SimState) -> Any:
+        return self._template.replace(
+            qpos=jnp.asarray(state.qpos),
+            qvel=jnp.asarray(state.qvel),
+            mocap_pos=jnp.asarray(state.mocap_pos),
+            mocap_quat=jnp.asarray(state.mocap_quat),
+        )
+
+
+def mjx_stepper(model: mujoco.MjModel) -> MjxStepper:
+    """The MJX stepper of ``model``; see the module's words for the signature."""
+    return MjxStepper(model)

@@ -199,9 +199,7 @@ def add_panda(
             name=f"{prefix}joint{i + 1}", target=f"{prefix}joint{i + 1}", trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         actuator.set_to_position(kp=POSITION_GAINS[i], kv=VELOCITY_GAINS[i])
-    gripper = spec.add_actuator(
-        name=f"{prefix}gripper", target=f"{prefix}fingers", trntype=mujoco.mjtTrn.mjTRN_TENDON
-    )
+    gripper = spec.add_actuator(name=f"{prefix}gripper", target=f"{prefix}fingers", trntype=mujoco.mjtTrn.mjTRN_TENDON)
     gripper.set_to_position(kp=2000.0, kv=100.0)
     gripper.forcelimited, gripper.forcerange = True, [-80.0, 80.0]
 

@@ -1,0 +1,179 @@
+"""Episodes of one task, B at a time: reset, observe, execute a key pose, judge."""
+
+import functools
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dsvla_jax.geometry.cameras import front_camera
+from dsvla_jax.sim import controller, raycast
+from dsvla_jax.sim import physics as physics_module
+from dsvla_jax.sim.physics import SimState
+from dsvla_jax.sim.scene import build_scene
+from dsvla_jax.sim.tasks import StateView, Task, get_task
+from dsvla_jax.types import Action, Array, Observation
+
+# A pose that no arm reaches: an action that cannot be planned leaves the arms still.
+_OUT_OF_REACH = np.array([0.0, 0.0, 100.0, 0.0, 1.0, 0.0, 0.0], np.float32)
+
+
+class Environment:
+    """A task in a simulator. It keeps compiled programs, never the state of an episode: every method is a function of
+    its arguments.
+
+    task: a Task or its name. physics: "mujoco" (C, for CPUs) or "mjx" (accelerators, jitted throughout).
+    image_size: height and width of the front camera's picture, pixels.
+    num_arms: only checked against the task's, for a caller that needs a certain number.
+    """
+
+    def __init__(
+        self,
+        task: Task | str,
+        physics: Literal["mujoco", "mjx"] = "mujoco",
+        image_size: int = 96,
+        num_arms: int | None = None,
+        shadows: bool = True,
+    ):
+        self.task = get_task(task) if isinstance(task, str) else task
+        if num_arms is not None and num_arms != self.task.num_arms:
+            raise ValueError(f"task {self.task.name!r} is for {self.task.num_arms} arm(s), not {num_arms}")
+        self.scene = build_scene(self.task)
+        self.num_arms = self.task.num_arms
+        self.image_size = image_size
+        self.camera = front_camera(image_size)
+        self._shadows = shadows
+        self._primitives = raycast.primitives_from_model(self.scene.mj_model)
+        self._arms = self.scene.arms
+        graspables = self.scene.graspables
+        self._welds = np.array([g.welds for g in graspables], np.int32).reshape(len(graspables), self.num_arms).T
+        self._half_extents = np.array([g.half_extents for g in graspables], np.float32).reshape(len(graspables), 3)
+        self._success_fn = self._holds  # one object, as it is a key of compiled programs
+
+        self._place = jax.jit(jax.vmap(lambda key: self.scene.place(self.task.sample(key))))
+        self._plan = jax.jit(jax.vmap(self._plan_one))
+        self._attach = jax.jit(jax.vmap(self._attach_one))
+        self._observe = jax.jit(jax.vmap(self._observe_one))
+        self._render = jax.jit(jax.vmap(self._render_one))
+        self._end_effector = jax.jit(jax.vmap(lambda qpos: controller.end_effector(qpos, self._arms)))
+        self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
+        self._expert = jax.jit(jax.vmap(lambda state: self.task.expert(self.view(state))))
+        if physics == "mujoco":
+            self._stepper = physics_module.mujoco_stepper(self.scene.mj_model)
+            self._execute = self._execute_on(self._plan, self._stepper, self._attach)
+        elif physics == "mjx":
+            self._stepper = physics_module.mjx_stepper(self.scene.mj_model)
+            jitted = jax.jit(self._execute_mjx)
+            self._execute = lambda state, action: jitted(self._stepper.mjx_model, state, action)
+        else:
+            raise ValueError(f"physics: expected 'mujoco' or 'mjx', got {physics!r}")
+
+    def view(self, state: SimState) -> StateView:
+        """What the task's functions read, of one example."""
+        return self.scene.view(state.qpos, state.mocap_pos, state.mocap_quat)
+
+    def reset(self, keys: Array) -> SimState:
+        """PRNG keys (B,) -> the B episodes' start: bodies placed and at rest, arms at the start posture."""
+        batch = len(keys)
+        placed = self._place(keys)
+        state = physics_module.initial_state(self.scene.mj_model, batch).replace(
+            qpos=placed.qpos,
+            ctrl=placed.ctrl,
+            mocap_pos=placed.mocap_pos,
+            mocap_quat=placed.mocap_quat,
+            geom_rgba=placed.geom_rgba,
+        )
+        hold = Action(
+            pose=jnp.broadcast_to(_OUT_OF_REACH, (batch, self.num_arms, 7)),
+            gripper_open=jnp.ones((batch, self.num_arms), jnp.float32),
+        )
+        settled = self.execute(state, hold)
+        return settled.replace(succeeded=state.succeeded, ik_failed=state.ik_failed)
+
+    def execute(self, state: SimState, action: Action) -> SimState:
+        """Moves to a key pose, then opens or closes the grippers. action: pose (B, A, 7), gripper_open (B, A).
+
+        In an episode whose pose is out of reach for any arm, nothing is moved and ``ik_failed`` is set.
+        """
+        expected = (state.qpos.shape[0], self.num_arms)
+        if action.pose.shape != (*expected, 7) or action.gripper_open.shape != expected:
+            raise ValueError(
+                f"action of task {self.task.name!r}: expected pose {(*expected, 7)} and gripper_open {expected}, got "
+                f"{tuple(action.pose.shape)} and {tuple(action.gripper_open.shape)}"
+            )
+        return self._execute(state, action)
+
+    def observe(self, state: SimState) -> Observation:
+        """What a policy sees of the B episodes; every field with the batch in front, the camera's too."""
+        return self._observe(state)
+
+    def render(self, state: SimState) -> tuple[Array, Array, Array]:
+        """rgb uint8 (B, H, W, 3), depth float32 (B, H, W) metres, segmentation int32 (B, H, W), geom ids, -1 sky."""
+        return self._render(state.geom_xpos, state.geom_xmat, state.geom_rgba)
+
+    def success(self, state: SimState) -> Array:
+        """bool (B,): the task's predicate has held at some physics step since reset."""
+        return jnp.asarray(state.succeeded)
+
+    def keypoints(self, state: SimState) -> Array:
+        """float32 (B, A, K, 3), the task's keypoints as the objects are now."""
+        return self._keypoints(state)
+
+    def expert(self, state: SimState) -> Action:
+        """The scripted demonstration from a reset state: pose (B, M, A, 7), gripper_open (B, M, A)."""
+        return self._expert(state)
+
+    def end_effector(self, state: SimState) -> tuple[Array, Array]:
+        """pose float32 (B, A, 7), gripper_open float32 (B, A)."""
+        return self._end_effector(state.qpos)
+
+    def _holds(self, state: SimState) -> Array:
+        return self.task.success(self.view(state))
+
+    def _plan_one(self, state: SimState, action: Action) -> controller.Plan:
+        return controller.plan(state.ctrl, state.eq_active, action, self._arms, self._welds)
+
+    def _attach_one(self, state: SimState, plan: controller.Plan) -> SimState:
+        poses, _ = controller.end_effector(state.qpos, self._arms)
+        view = self.view(state)
+        bodies = [view.body_pose(graspable.body) for graspable in self.task.graspables]
+        eq_active, eq_data = controller.attach(
+            state.eq_active,
+            state.eq_data,
+            poses,
+            plan.closing,
+            jnp.stack(bodies) if bodies else jnp.zeros((0, 7)),
+            self._half_extents,
+            self._welds,
+        )
+        return state.replace(eq_active=eq_active, eq_data=eq_data, ik_failed=state.ik_failed | ~plan.ok)
+
+    def _execute_on(self, plan_batch: Any, stepper: Any, attach_batch: Any) -> Any:
+        def execute(state: SimState, action: Action) -> SimState:
+            plan = plan_batch(state, action)
+            state = stepper(state, plan.controls, self._success_fn, plan.eq_active)
+            return attach_batch(state, plan)
+
+        return execute
+
+    def _execute_mjx(self, mjx_model: Any, state: SimState, action: Action) -> SimState:
+        stepper = functools.partial(self._stepper, mjx_model=mjx_model)
+        return self._execute_on(jax.vmap(self._plan_one), stepper, jax.vmap(self._attach_one))(state, action)
+
+    def _render_one(self, geom_xpos: Array, geom_xmat: Array, geom_rgba: Array) -> tuple[Array, Array, Array]:
+        return raycast.render(
+            self._primitives,
+            geom_xpos,
+            geom_xmat,
+            geom_rgba,
+            self.camera,
+            self.image_size,
+            self.image_size,
+            shadows=self._shadows,
+        )
+
+    def _observe_one(self, state: SimState) -> Observation:
+        rgb, depth, _ = self._render_one(state.geom_xpos, state.geom_xmat, state.geom_rgba)
+        pose, gripper_open = controller.end_effector(state.qpos, self._arms)
+        return Observation(rgb=rgb, depth=depth, camera=self.camera, pose=pose, gripper_open=gripper_open)
