@@ -22,11 +22,12 @@ from dsvla_jax.geometry.rotations import (
     quaternion_to_wxyz,
 )
 from dsvla_jax.sim import robot
-from dsvla_jax.sim.kinematics import forward_kinematics, inverse_kinematics
+from dsvla_jax.sim.kinematics import forward_kinematics, reaches, track
 from dsvla_jax.sim.robot import Arm
 from dsvla_jax.types import Action, Array
 
 WAYPOINTS = 8
+WAYPOINT_ITERATIONS, LAST_ITERATIONS = 6, 20  # of inverse kinematics, each from the waypoint before
 MOVE_STEPS, SETTLE_STEPS, GRIPPER_STEPS = 90, 20, 40
 KEYFRAME_STEPS = MOVE_STEPS + SETTLE_STEPS + GRIPPER_STEPS
 GRASP_MARGIN = 0.01  # metres around a graspable's box within which the tool centre point counts as on it
@@ -53,18 +54,16 @@ def straight_line(start: Array, end: Array) -> Array:
 
 
 def plan_joints(joints: Array, pose: Array, base: Array) -> tuple[Array, Array]:
-    """Joint angles (7,) now, target pose (7,), base (7,) -> knots (WAYPOINTS + 1, 7) in joint space, ok bool ()."""
+    """Joint angles (7,) now, target pose (7,), base (7,) -> knots (WAYPOINTS + 1, 7) in joint space, ok bool ().
+
+    Only the key pose itself must be reached; a waypoint on the way that is not bends the path.
+    """
     end = jnp.concatenate([pose[:3], normalize(pose[3:])])
     line = straight_line(forward_kinematics(joints, base), end)
-
-    def step(seed: Array, waypoint: Array) -> tuple[Array, Array]:
-        solution, _ = inverse_kinematics(waypoint, seed, base, iterations=6)
-        return solution, solution
-
-    seed, knots = jax.lax.scan(step, joints, line[:-1])
-    # Only the key pose itself must be reached; a waypoint that is not bends the path.
-    last, ok = inverse_kinematics(end, seed, base, iterations=20)
-    return jnp.concatenate([joints[None], knots, last[None]]), ok
+    steps = np.array([WAYPOINT_ITERATIONS] * (WAYPOINTS - 1) + [LAST_ITERATIONS])
+    solutions = track(line[np.repeat(np.arange(WAYPOINTS), steps)], joints, base)
+    knots = jnp.concatenate([joints[None], solutions[np.cumsum(steps) - 1]])
+    return knots, reaches(knots[-1], end, base)
 
 
 def _time_warp() -> tuple[np.ndarray, np.ndarray]:

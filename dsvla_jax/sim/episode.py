@@ -1,6 +1,7 @@
 """Episodes of one task, B at a time: reset, observe, execute a key pose, judge."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
@@ -52,20 +53,19 @@ class Environment:
         self._success_fn = self._holds  # one object, as it is a key of compiled programs
 
         self._place = jax.jit(jax.vmap(lambda key: self.scene.place(self.task.sample(key))))
-        self._plan = jax.jit(jax.vmap(self._plan_one))
-        self._attach = jax.jit(jax.vmap(self._attach_one))
         self._observe = jax.jit(jax.vmap(self._observe_one))
         self._render = jax.jit(jax.vmap(self._render_one))
         self._end_effector = jax.jit(jax.vmap(lambda qpos: controller.end_effector(qpos, self._arms)))
         self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
         self._expert = jax.jit(jax.vmap(lambda state: self.task.expert(self.view(state))))
         if physics == "mujoco":
-            self._stepper = physics_module.mujoco_stepper(self.scene.mj_model)
-            self._execute = self._execute_on(self._plan, self._stepper, self._attach)
+            stepper = physics_module.mujoco_stepper(self.scene.mj_model)
+            plan, attach = jax.jit(jax.vmap(self._plan_one)), jax.jit(jax.vmap(self._attach_one))
+            self._execute = self._execute_on(plan, stepper, attach)
         elif physics == "mjx":
-            self._stepper = physics_module.mjx_stepper(self.scene.mj_model)
-            jitted = jax.jit(self._execute_mjx)
-            self._execute = lambda state, action: jitted(self._stepper.mjx_model, state, action)
+            stepper = physics_module.mjx_stepper(self.scene.mj_model)
+            jitted = jax.jit(self._execute_mjx(stepper))
+            self._execute = lambda state, action: jitted(stepper.mjx_model, state, action)
         else:
             raise ValueError(f"physics: expected 'mujoco' or 'mjx', got {physics!r}")
 
@@ -149,7 +149,7 @@ class Environment:
         )
         return state.replace(eq_active=eq_active, eq_data=eq_data, ik_failed=state.ik_failed | ~plan.ok)
 
-    def _execute_on(self, plan_batch: Any, stepper: Any, attach_batch: Any) -> Any:
+    def _execute_on(self, plan_batch: Any, stepper: Any, attach_batch: Any) -> Callable[[SimState, Action], SimState]:
         def execute(state: SimState, action: Action) -> SimState:
             plan = plan_batch(state, action)
             state = stepper(state, plan.controls, self._success_fn, plan.eq_active)
@@ -157,9 +157,12 @@ class Environment:
 
         return execute
 
-    def _execute_mjx(self, mjx_model: Any, state: SimState, action: Action) -> SimState:
-        stepper = functools.partial(self._stepper, mjx_model=mjx_model)
-        return self._execute_on(jax.vmap(self._plan_one), stepper, jax.vmap(self._attach_one))(state, action)
+    def _execute_mjx(self, stepper: physics_module.MjxStepper) -> Callable[[Any, SimState, Action], SimState]:
+        def execute(mjx_model: Any, state: SimState, action: Action) -> SimState:
+            run = functools.partial(stepper, mjx_model=mjx_model)
+            return self._execute_on(jax.vmap(self._plan_one), run, jax.vmap(self._attach_one))(state, action)
+
+        return execute
 
     def _render_one(self, geom_xpos: Array, geom_xmat: Array, geom_rgba: Array) -> tuple[Array, Array, Array]:
         return raycast.render(

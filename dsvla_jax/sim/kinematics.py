@@ -93,47 +93,46 @@ def _pose_error(chain: Chain, target: Array) -> Array:
 
 
 def _solve_spd(matrix: Array, right: Array) -> Array:
-    """Solves a small symmetric positive definite system, matrix (n, n), right (n, m), by unrolled Cholesky.
+    """Solves a small symmetric positive definite system, matrix (n, n), right (n,), by an unrolled Cholesky.
 
-    Batched small systems are slow through LAPACK on a CPU and through general solvers on accelerators.
+    Batches of such small systems are slow through LAPACK on a CPU and through general solvers on accelerators.
     """
     n = matrix.shape[0]
-    rows, columns = list(right), []
+    entries, factor = [right[i] for i in range(n)], []
     for i in range(n):
         pivot = jax.lax.rsqrt(matrix[i, i])
         column = matrix[:, i] * pivot
-        columns.append((column, pivot))
-        rows[i] = rows[i] * pivot
+        # forward substitution goes along: the entries become those of inverse(L) right
+        entries[i] = entries[i] * pivot
         for j in range(i + 1, n):
-            rows[j] = rows[j] - column[j] * rows[i]
+            entries[j] = entries[j] - column[j] * entries[i]
         matrix = matrix - jnp.outer(column, column)
+        factor.append((column, pivot))
     for i in reversed(range(n)):
-        column, pivot = columns[i]
+        column, pivot = factor[i]
         for j in range(i + 1, n):
-            rows[i] = rows[i] - column[j] * rows[j]
-        rows[i] = rows[i] * pivot
-    return jnp.stack(rows)
+            entries[i] = entries[i] - column[j] * entries[j]
+        entries[i] = entries[i] * pivot
+    return jnp.stack(entries)
 
 
-def inverse_kinematics(pose: Array, seed: Array, base: Array, iterations: int = 20) -> tuple[Array, Array]:
-    """Joint angles that bring the tool centre point to ``pose``, found from ``seed``.
+def track(targets: Array, seed: Array, base: Array) -> Array:
+    """One step of inverse kinematics towards each of the target poses in turn.
 
     Damped least squares with the damping tied to the error (Sugihara 2011, "Solvability-unconcerned inverse
     kinematics by the Levenberg-Marquardt method"), a step in the null space towards ``REST_JOINTS``, and the joint
     limits as a clip after each step.
 
     Args:
-        pose: float32 (7,). Its quaternion need not be normalised.
-        seed: float32 (7,). base: float32 (7,) pose of the arm's base in the world.
-        iterations: fixed, so that shapes and time are static.
+        targets: float32 (M, 7), unit quaternions. seed: float32 (7,) joint angles.
+        base: float32 (7,) pose of the arm's base in the world.
     Returns:
-        joints float32 (7,) within the limits, and ok: bool (), True if the pose is reached within 2 mm and 0.02 rad.
+        float32 (M, 7) joint angles after each step, within the limits.
     """
-    pose = jnp.concatenate([pose[:3], normalize(pose[3:])])
 
-    def step(joints: Array, _: None) -> tuple[Array, None]:
+    def step(joints: Array, target: Array) -> tuple[Array, Array]:
         chain = _chain(joints, base)
-        error = _pose_error(chain, pose)
+        error = _pose_error(chain, target)
         # A far target is approached in bounded steps: the linearisation holds only nearby.
         error = error * jnp.minimum(1.0, 0.5 / jnp.maximum(jnp.linalg.norm(error), 1e-9))
         linear = jnp.cross(chain.axes, chain.position - chain.origins)
@@ -141,11 +140,30 @@ def inverse_kinematics(pose: Array, seed: Array, base: Array, iterations: int = 
         damping = 0.02 * jnp.sum(error**2) + 1e-5
         gram = jacobian @ jacobian.T + damping * jnp.eye(6, dtype=jnp.float32)
         rest = 0.1 * (REST_JOINTS - joints)
-        change = rest + jacobian.T @ _solve_spd(gram, (error - jacobian @ rest)[:, None])[:, 0]
+        change = rest + jacobian.T @ _solve_spd(gram, error - jacobian @ rest)
         change = change * jnp.minimum(1.0, 1.0 / jnp.maximum(jnp.max(jnp.abs(change)), 1e-9))
-        return jnp.clip(joints + change, _JOINT_LOW, _JOINT_HIGH), None
+        joints = jnp.clip(joints + change, _JOINT_LOW, _JOINT_HIGH)
+        return joints, joints
 
-    joints, _ = jax.lax.scan(step, jnp.asarray(seed, jnp.float32), length=iterations)
+    return jax.lax.scan(step, jnp.asarray(seed, jnp.float32), targets)[1]
+
+
+def reaches(joints: Array, pose: Array, base: Array) -> Array:
+    """bool (): whether the joints (7,) hold the tool centre point within 2 mm and 0.02 rad of ``pose`` (7,)."""
     error = _pose_error(_chain(joints, base), pose)
-    ok = (jnp.linalg.norm(error[:3]) < POSITION_TOLERANCE) & (jnp.linalg.norm(error[3:]) < ROTATION_TOLERANCE)
-    return joints, ok
+    return (jnp.linalg.norm(error[:3]) < POSITION_TOLERANCE) & (jnp.linalg.norm(error[3:]) < ROTATION_TOLERANCE)
+
+
+def inverse_kinematics(pose: Array, seed: Array, base: Array, iterations: int = 20) -> tuple[Array, Array]:
+    """Joint angles that bring the tool centre point to ``pose``, found from ``seed`` by ``track``.
+
+    Args:
+        pose: float32 (7,). Its quaternion need not be normalised.
+        seed: float32 (7,). base: float32 (7,) pose of the arm's base in the world.
+        iterations: fixed, so that shapes and time are static.
+    Returns:
+        joints float32 (7,) within the limits, and ok: bool (), True if the pose is reached.
+    """
+    pose = jnp.concatenate([pose[:3], normalize(pose[3:])])
+    joints = track(jnp.broadcast_to(pose, (iterations, 7)), seed, base)[-1]
+    return joints, reaches(joints, pose, base)

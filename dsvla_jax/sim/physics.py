@@ -26,8 +26,7 @@ from flax import struct
 from dsvla_jax.types import Array
 
 
-@struct.dataclass
-class SimState:
+class SimState(struct.PyTreeNode):
     """The whole state of B episodes. Quaternions inside qpos and mocap_quat are wxyz, MuJoCo's order.
 
     qpos: float32 (B, nq). qvel: float32 (B, nv). ctrl: float32 (B, nu), the last controls.
@@ -133,14 +132,17 @@ class MujocoStepper:
             self._models[i].body_pos[mocap_bodies] = mocap_pos[i, mocap_ids]
             self._models[i].body_quat[mocap_bodies] = mocap_quat[i, mocap_ids]
         if eq_active is None:
-            eq_active = np.broadcast_to(np.asarray(state.eq_active)[:, None], (batch, steps, model.neq))
+            active = np.broadcast_to(np.asarray(state.eq_active)[:, None], (batch, steps, model.neq))
+        else:
+            active = np.asarray(eq_active)
         spec = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_EQ_ACTIVE)
-        inputs = np.concatenate([np.asarray(controls, np.float64), np.asarray(eq_active, np.float64)], axis=-1)
+        inputs = np.concatenate([np.asarray(controls, np.float64), active.astype(np.float64)], axis=-1)
         start = np.concatenate([np.zeros((batch, 1)), np.asarray(state.qpos), np.asarray(state.qvel)], axis=1)
         if model.na or model.npluginstate:
             raise ValueError(
                 "the model has actuator activations or plugins, which SimState does not carry: remove them"
             )
+        history: Any
         history, _ = self._pool.rollout(self._models[:batch], self._data, start, inputs, control_spec=spec)
 
         # MuJoCo resets an episode that diverges, and its clock with it.
@@ -157,7 +159,7 @@ class MujocoStepper:
             qpos=qpos[:, -1],
             qvel=qvel[:, -1],
             ctrl=np.asarray(controls, np.float32)[:, -1],
-            eq_active=np.asarray(eq_active, bool)[:, -1],
+            eq_active=active[:, -1],
             succeeded=succeeded,
             diverged=np.asarray(state.diverged) | ~ok,
         )
