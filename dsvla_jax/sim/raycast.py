@@ -1,3 +1,5 @@
+# pyright: reportAttributeAccessIssue=false
+# (mujoco's extension modules export names that pyright cannot see)
 """A ray caster for MuJoCo's primitive geoms, in pure JAX: colour, planar depth and segmentation in one pass.
 
 It replaces an OpenGL renderer where the picture must be made inside a jitted program, or where no GL exists. Every
@@ -92,8 +94,10 @@ def _dot(a: Vector, b: Vector) -> Array:
 
 
 def _into(rotation: Array, v: Vector) -> Vector:
-    """World to local: the transpose of ``rotation`` (3, 3), whose columns are the local axes in the world, times v."""
-    return Vector(*(rotation[0, i] * v.x + rotation[1, i] * v.y + rotation[2, i] * v.z for i in range(3)))
+    """World to local: the transpose of ``rotation`` (..., 3, 3), whose columns are the local axes in the world."""
+    return Vector(
+        *(rotation[..., 0, i] * v.x + rotation[..., 1, i] * v.y + rotation[..., 2, i] * v.z for i in range(3))
+    )
 
 
 def _out_of(rotation: Array, v: Vector) -> Vector:
@@ -241,7 +245,7 @@ def _cast(primitives: Primitives, xpos, xmat, rgba, eye: Array, d: Vector, shado
     rotation, offset = xmat[geom], eye - xpos[geom]
     world_from_eye = Vector(*(distance * c for c in d))
     relative = Vector(*(offset[:, i] + c for i, c in enumerate(world_from_eye)))
-    local = Vector(*(sum(rotation[:, j, i] * relative[j] for j in range(3)) for i in range(3)))
+    local = _into(rotation, relative)
     size = Vector(*primitives.sizes[geom].T)
     normal = _unit(_out_of(rotation, _local_normal(kinds, local, size)))
 

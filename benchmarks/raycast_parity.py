@@ -1,0 +1,220 @@
+"""Does the JAX ray caster see what MuJoCo sees? Run ``MUJOCO_GL=egl python -m benchmarks.raycast_parity --gl``.
+
+Two oracles: ``mj_multiRay``, which intersects the same rays in double precision without OpenGL, and, with --gl, the
+OpenGL renderer, which tessellates curved geoms and samples pixel centres. The ray caster's pixel (u, v) is the ray
+through exactly (u, v), so against OpenGL its principal point is moved by half a pixel; then both sample the same rays.
+Ids must agree on 99.9 % of the pixels, and where they agree the 99th percentile of the depth error must be below 1 mm.
+The exit code is 1 on a shortfall and 77 when no OpenGL context can be made.
+"""
+# pyright: reportAttributeAccessIssue=false
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Iterator
+
+import cv2
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from dsvla_jax.geometry.cameras import front_camera
+from dsvla_jax.sim import raycast
+from dsvla_jax.types import Camera
+
+MIN_AGREEMENT = 0.999
+MAX_DEPTH_ERROR = 1e-3
+NO_OPENGL = 77
+
+
+@dataclasses.dataclass(frozen=True)
+class Parity:
+    """agreement: fraction of pixels with equal ids. depth_p50, depth_p99: metres, over pixels with equal geom ids."""
+
+    agreement: float
+    depth_p50: float
+    depth_p99: float
+
+    @property
+    def passed(self) -> bool:
+        return self.agreement >= MIN_AGREEMENT and self.depth_p99 < MAX_DEPTH_ERROR
+
+
+def compare(segmentation, depth, expected_segmentation, expected_depth) -> Parity:
+    """How far two pictures are apart; all arguments (H, W)."""
+    same = np.asarray(segmentation) == np.asarray(expected_segmentation)
+    error = np.abs(np.asarray(depth) - expected_depth)[same & (np.asarray(segmentation) >= 0)]
+    p50, p99 = np.percentile(error, [50, 99]) if error.size else (np.nan, np.nan)
+    return Parity(float(same.mean()), float(p50), float(p99))
+
+
+def primitive_scene(seed: int = 0) -> mujoco.MjModel:
+    """Every drawable type at random poses on a table (a finite plane) over a floor (an infinite one).
+
+    In front of them are spheres hidden by group and by alpha.
+    """
+    kinds = mujoco.mjtGeom
+    rng = np.random.default_rng(seed)
+    spec = mujoco.MjSpec()
+    world = spec.worldbody
+    world.add_geom(type=kinds.mjGEOM_PLANE, size=[0, 0, 1], rgba=[0.5, 0.5, 0.55, 1])
+    world.add_geom(type=kinds.mjGEOM_PLANE, size=[0.5, 0.4, 1], pos=[0.1, 0, 0.752], rgba=[0.6, 0.5, 0.35, 1])
+    curved = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
+    for kind in (*curved, kinds.mjGEOM_BOX):
+        for _ in range(4):
+            quat = rng.normal(size=4)
+            world.add_geom(
+                type=kind,
+                size=rng.uniform(0.02, 0.08, 3),
+                pos=rng.uniform([-0.2, -0.35, 0.78], [0.4, 0.35, 1.3]),
+                quat=quat / np.linalg.norm(quat),
+                rgba=[*rng.uniform(0.2, 0.9, 3), 1],
+            )
+    world.add_geom(type=kinds.mjGEOM_SPHERE, size=[0.1, 0, 0], pos=[0.6, 0, 1.2], group=3)
+    world.add_geom(type=kinds.mjGEOM_SPHERE, size=[0.1, 0, 0], pos=[0.6, 0.1, 1.2], rgba=[1, 1, 1, 0])
+    return spec.compile()
+
+
+def raycast_view(model, data, camera: Camera, size: int, far: float = 1e6):
+    """rgb, depth and segmentation of the ray caster as numpy arrays."""
+    primitives = raycast.primitives_from_model(model)
+    arrays = (jnp.asarray(a, jnp.float32) for a in (data.geom_xpos, data.geom_xmat, model.geom_rgba))
+    return tuple(np.asarray(a) for a in raycast.render(primitives, *arrays, camera, size, size, far=far))
+
+
+def mujoco_rays(model, data, camera: Camera, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Segmentation and planar depth (H, W) by mj_multiRay over the same rays; groups 0 to 2 only."""
+    directions = np.asarray(raycast.pixel_directions(camera, size, size), np.float64).reshape(-1, 3)
+    # Unit directions, so that distances are metric: planar depth is the distance over the length of a Z = 1 ray.
+    length = np.linalg.norm(directions, axis=1)
+    ids, distance = np.zeros(len(directions), np.int32), np.zeros(len(directions))
+    eye = np.asarray(camera.world_from_camera, np.float64)[:3, 3].copy()
+    groups = np.array([1, 1, 1, 0, 0, 0], np.uint8)
+    unit = (directions / length[:, None]).reshape(-1)
+    mujoco.mj_multiRay(model, data, eye, unit, groups, True, -1, ids, distance, None, len(ids), 1e6)
+    depth = np.where(ids >= 0, distance / length, 0.0)
+    return ids.reshape(size, size), depth.reshape(size, size)
+
+
+def half_pixel_shifted(camera: Camera) -> Camera:
+    """The camera whose pixel (u, v) is the ray through (u + 0.5, v + 0.5) of ``camera``: OpenGL's pixel centre."""
+    shift = jnp.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], jnp.float32)
+    return camera.replace(intrinsics=camera.intrinsics - shift)
+
+
+class OpenGLViews:
+    """mujoco.Renderer looking through a ``Camera`` whose principal point is the middle of its square image."""
+
+    def __init__(self, model: mujoco.MjModel, size: int):
+        model.vis.quality.numslices = model.vis.quality.numstacks = 128  # finer than a pixel
+        self._renderer = mujoco.Renderer(model, size, size)
+        self._option = mujoco.MjvOption()
+        self._option.sitegroup[:] = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._renderer.close()
+
+    def view(self, data, camera: Camera):
+        """rgb uint8 (H, W, 3), depth in metres, segmentation with -1 where no geom is."""
+        renderer = self._renderer
+        rgb = self._look(data, camera)
+        renderer.enable_depth_rendering()
+        depth = self._look(data, camera)
+        renderer.disable_depth_rendering()
+        renderer.enable_segmentation_rendering()
+        identity, kind = np.moveaxis(self._look(data, camera), -1, 0)
+        renderer.disable_segmentation_rendering()
+        return rgb, depth, np.where(kind == int(mujoco.mjtObj.mjOBJ_GEOM), identity, -1)
+
+    def _look(self, data, camera: Camera) -> np.ndarray:
+        renderer = self._renderer
+        renderer.update_scene(data, scene_option=self._option)
+        pose = np.asarray(camera.world_from_camera, np.float64)
+        for eye in renderer.scene.camera:
+            eye.pos, eye.forward, eye.up = pose[:3, 3], pose[:3, 2], pose[:3, 1]
+            eye.frustum_top = eye.frustum_near * 0.5 * renderer.height / -float(camera.intrinsics[0, 0])
+            eye.frustum_bottom = -eye.frustum_top
+            eye.frustum_center, eye.frustum_width = 0.0, 0.0  # 0: as the viewport's shape demands
+        return renderer.render().copy()
+
+
+def task_scenes(names: list[str]) -> Iterator[tuple[str, mujoco.MjModel, mujoco.MjData]]:
+    """The scene of each task (all if ``names`` is empty) at a sampled start."""
+    from dsvla_jax.sim.scene import build_scene
+    from dsvla_jax.sim.tasks import TASKS, get_task
+
+    for name in names or sorted(TASKS):
+        scene = build_scene(get_task(name))
+        model, state = scene.mj_model, scene.place(scene.task.sample(jax.random.key(0)))
+        data = mujoco.MjData(model)
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = state.qpos, state.mocap_pos, state.mocap_quat
+        model.geom_rgba[:] = state.geom_rgba
+        yield name, model, data
+
+
+def timed(function, *args):
+    start = time.perf_counter()
+    return function(*args), (time.perf_counter() - start) * 1e3
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", default="", help="comma-separated; default: all")
+    parser.add_argument("--size", type=int, default=96, help="pixels a side")
+    parser.add_argument("--primitives-only", action="store_true", help="only the scene of all primitives")
+    parser.add_argument("--gl", action="store_true", help="compare with OpenGL too")
+    parser.add_argument("--pictures", default="", help="folder for pictures: ray caster | OpenGL (with --gl)")
+    args = parser.parse_args()
+
+    def scenes():
+        model = primitive_scene()
+        yield "all primitives", model, mujoco.MjData(model)
+        if not args.primitives_only:
+            yield from task_scenes([name for name in args.tasks.split(",") if name])
+
+    camera = front_camera(args.size)
+    table = Table("scene", "geoms", "oracle", "same ids %", "depth p50 mm", "p99 mm", "ms", "oracle ms", "verdict")
+    failed = 0
+
+    def add(name, model, oracle, parity, ours, theirs):
+        nonlocal failed
+        failed += not parity.passed
+        agreement, verdict = f"{parity.agreement * 100:.3f}", "ok" if parity.passed else "[red]SHORT[/red]"
+        errors = (f"{1e3 * parity.depth_p50:.4f}", f"{1e3 * parity.depth_p99:.4f}")
+        table.add_row(name, str(model.ngeom), oracle, agreement, *errors, f"{ours:.1f}", f"{theirs:.1f}", verdict)
+
+    for name, model, data in scenes():
+        mujoco.mj_forward(model, data)
+        raycast_view(model, data, camera, args.size)  # compiles
+        (rgb, depth, segmentation), ours = timed(raycast_view, model, data, camera, args.size)
+        (ids, distance), theirs = timed(mujoco_rays, model, data, camera, args.size)
+        add(name, model, "rays", compare(segmentation, depth, ids, distance), ours, theirs)
+        pictures = [rgb]
+        if args.gl:
+            try:
+                views = OpenGLViews(model, args.size)
+            except Exception as error:  # a missing GL library surfaces as any of several types
+                print(f"no OpenGL context (MUJOCO_GL={os.environ.get('MUJOCO_GL')}): {error}", file=sys.stderr)
+                return NO_OPENGL
+            with views:
+                (gl_rgb, distance, ids), theirs = timed(views.view, data, camera)
+            _, depth, segmentation = raycast_view(model, data, half_pixel_shifted(camera), args.size)
+            add(name, model, "OpenGL", compare(segmentation, depth, ids, distance), ours, theirs)
+            pictures.append(gl_rgb)
+        if args.pictures:
+            os.makedirs(args.pictures, exist_ok=True)
+            cv2.imwrite(os.path.join(args.pictures, f"{name.replace(' ', '_')}.png"), np.hstack(pictures)[..., ::-1])
+    Console(width=max(110, Console().width)).print(table)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
