@@ -3,7 +3,8 @@
 Two oracles: ``mj_multiRay``, which intersects the same rays in double precision without OpenGL, and, with --gl, the
 OpenGL renderer, which tessellates curved geoms and samples pixel centres. The ray caster's pixel (u, v) is the ray
 through exactly (u, v), so against OpenGL its principal point is moved by half a pixel; then both sample the same rays.
-Ids must agree on 99.9 % of the pixels, and where they agree the 99th percentile of the depth error must be below 1 mm.
+Ids must agree on 99.9 % of the pixels (or name surfaces that coincide), and there the 99th percentile of the depth
+error must be below 1 mm.
 The exit code is 1 on a shortfall and 77 when no OpenGL context can be made.
 """
 # pyright: reportAttributeAccessIssue=false
@@ -29,14 +30,18 @@ from dsvla_jax.types import Camera
 
 MIN_AGREEMENT = 0.999
 MAX_DEPTH_ERROR = 1e-3
+TIE = 1e-4  # metres
 NO_OPENGL = 77
 
 
 @dataclasses.dataclass(frozen=True)
 class Parity:
-    """agreement: fraction of pixels with equal ids. depth_p50, depth_p99: metres, over pixels with equal geom ids."""
+    """agreement: fraction of pixels with equal ids or of a tie; ties: fraction of pixels whose ids differ but whose
+    depths do not, coincident surfaces where either id is right. depth_p50, depth_p99: metres, over agreeing pixels.
+    """
 
     agreement: float
+    ties: float
     depth_p50: float
     depth_p99: float
 
@@ -47,10 +52,12 @@ class Parity:
 
 def compare(segmentation, depth, expected_segmentation, expected_depth) -> Parity:
     """How far two pictures are apart; all arguments (H, W)."""
-    same = np.asarray(segmentation) == np.asarray(expected_segmentation)
-    error = np.abs(np.asarray(depth) - expected_depth)[same & (np.asarray(segmentation) >= 0)]
-    p50, p99 = np.percentile(error, [50, 99]) if error.size else (np.nan, np.nan)
-    return Parity(float(same.mean()), float(p50), float(p99))
+    same = segmentation == expected_segmentation
+    hit = (segmentation >= 0) & (expected_segmentation >= 0)
+    error = np.abs(depth - expected_depth)
+    ties = ~same & hit & (error < TIE)
+    p50, p99 = np.percentile(error[hit & (same | ties)], [50, 99]) if (hit & same).any() else (np.nan, np.nan)
+    return Parity(float((same | ties).mean()), float(ties.mean()), float(p50), float(p99))
 
 
 def primitive_scene(seed: int = 0) -> mujoco.MjModel:
@@ -161,8 +168,13 @@ def task_scenes(names: list[str]) -> Iterator[tuple[str, mujoco.MjModel, mujoco.
 
 
 def timed(function, *args):
-    start = time.perf_counter()
-    return function(*args), (time.perf_counter() - start) * 1e3
+    """The result and the milliseconds of the fastest of three calls, after one that warms up."""
+    result, elapsed = function(*args), []
+    for _ in range(3):
+        start = time.perf_counter()
+        result = function(*args)
+        elapsed.append((time.perf_counter() - start) * 1e3)
+    return result, min(elapsed)
 
 
 def main() -> int:
@@ -181,19 +193,21 @@ def main() -> int:
             yield from task_scenes([name for name in args.tasks.split(",") if name])
 
     camera = front_camera(args.size)
-    table = Table("scene", "geoms", "oracle", "same ids %", "depth p50 mm", "p99 mm", "ms", "oracle ms", "verdict")
+    table = Table(
+        "scene", "geoms", "oracle", "same %", "ties %", "depth p50 mm", "p99 mm", "ms", "oracle ms", "verdict"
+    )
     failed = 0
 
     def add(name, model, oracle, parity, ours, theirs):
         nonlocal failed
         failed += not parity.passed
-        agreement, verdict = f"{parity.agreement * 100:.3f}", "ok" if parity.passed else "[red]SHORT[/red]"
+        agreement = (f"{parity.agreement * 100:.3f}", f"{parity.ties * 100:.3f}")
+        verdict = "ok" if parity.passed else "[red]SHORT[/red]"
         errors = (f"{1e3 * parity.depth_p50:.4f}", f"{1e3 * parity.depth_p99:.4f}")
-        table.add_row(name, str(model.ngeom), oracle, agreement, *errors, f"{ours:.1f}", f"{theirs:.1f}", verdict)
+        table.add_row(name, str(model.ngeom), oracle, *agreement, *errors, f"{ours:.1f}", f"{theirs:.1f}", verdict)
 
     for name, model, data in scenes():
         mujoco.mj_forward(model, data)
-        raycast_view(model, data, camera, args.size)  # compiles
         (rgb, depth, segmentation), ours = timed(raycast_view, model, data, camera, args.size)
         (ids, distance), theirs = timed(mujoco_rays, model, data, camera, args.size)
         add(name, model, "rays", compare(segmentation, depth, ids, distance), ours, theirs)
@@ -212,7 +226,7 @@ def main() -> int:
         if args.pictures:
             os.makedirs(args.pictures, exist_ok=True)
             cv2.imwrite(os.path.join(args.pictures, f"{name.replace(' ', '_')}.png"), np.hstack(pictures)[..., ::-1])
-    Console(width=max(110, Console().width)).print(table)
+    Console(width=max(120, Console().width)).print(table)
     return 1 if failed else 0
 
 

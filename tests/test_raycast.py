@@ -52,7 +52,7 @@ def test_all_primitives_agree_with_mujocos_rays(camera, seed):
     drawn = {int(model.geom_type[i]) for i in np.unique(segmentation) if i >= 0}
     assert drawn == {raycast.PLANE, raycast.SPHERE, raycast.ELLIPSOID, raycast.CAPSULE, raycast.CYLINDER, raycast.BOX}
     parity = compare(segmentation, depth, *mujoco_rays(model, data, camera, SIZE))
-    assert parity.agreement >= 0.999
+    assert parity.agreement - parity.ties >= 0.999
     assert parity.depth_p99 < 1e-3
 
 
@@ -107,7 +107,7 @@ def test_hidden_geoms_are_not_drawn(camera):
     shields = [{**BLOCK, "pos": [0.8, 0, 1.3], "size": [0.01, 2, 2]} for _ in range(2)]
     shields[0]["group"], shields[1]["rgba"] = 3, [1, 1, 1, 0]
     model, data = scene(TABLE, *shields)
-    np.testing.assert_array_equal(raycast.primitives_from_model(model).groups, ((raycast.PLANE, (0,)),))
+    assert raycast.primitives_from_model(model).groups == ((raycast.PLANE, (0,)),)
     model, data = scene(TABLE, BLOCK)
     primitives = raycast.primitives_from_model(model)
     xpos, xmat, rgba = arrays(model, data)
@@ -141,21 +141,25 @@ def test_a_batch_equals_its_pictures(camera):
     primitives = raycast.primitives_from_model(model)
     xpos, xmat, rgba = arrays(model, data)
     batch = (jnp.stack([xpos, xpos + 0.05]), jnp.stack([xmat, xmat]), jnp.stack([rgba, rgba[:, ::-1].at[:, 3].set(1)]))
-    together = jax.vmap(lambda *a: raycast.render(primitives, *a, camera, 32, 32))(*batch)
+    together = jax.vmap(lambda *a: raycast.render(primitives, *a, camera, SIZE, SIZE))(*batch)
     for i in range(2):
-        alone = raycast.render(primitives, *(a[i] for a in batch), camera, 32, 32)
-        assert np.mean(np.asarray(together[2][i]) == alone[2]) > 0.999
+        alone = raycast.render(primitives, *(a[i] for a in batch), camera, SIZE, SIZE)
+        np.testing.assert_array_equal(together[2][i], alone[2])
         np.testing.assert_allclose(together[1][i], alone[1], atol=1e-4)
         assert np.abs(np.asarray(together[0][i], int) - np.asarray(alone[0], int)).max() <= 1
 
 
-def test_rows_traced_in_blocks_make_the_same_picture(camera, monkeypatch):
-    model, data = scene(FLOOR, TABLE, BLOCK)
-    whole = raycast_view(model, data, camera, SIZE)
-    monkeypatch.setattr(raycast, "MAX_BLOCK_RAYS", 8 * SIZE)
-    jax.clear_caches()
-    for blocked, expected in zip(raycast_view(model, data, camera, SIZE), whole, strict=True):
-        np.testing.assert_array_equal(blocked, expected)
+def test_rows_traced_in_blocks_make_the_same_picture(camera):
+    """A picture too tall to be traced at once begins with the rows of a small one: the camera is the same."""
+    tall = 4 * SIZE
+    assert SIZE * SIZE < raycast.MAX_BLOCK_RAYS < tall * SIZE
+    model, data = scene(TABLE, BLOCK)
+    primitives = raycast.primitives_from_model(model)
+    small = raycast.render(primitives, *arrays(model, data), camera, SIZE, SIZE)
+    for blocked, expected in zip(
+        raycast.render(primitives, *arrays(model, data), camera, tall, SIZE), small, strict=True
+    ):
+        np.testing.assert_allclose(np.asarray(blocked[:SIZE], float), np.asarray(expected, float), atol=1e-5)
 
 
 def test_a_mesh_is_refused_by_name():
