@@ -1,0 +1,48 @@
+"""Multi-head attention over head-major arrays, shared by both towers."""
+
+import jax
+import jax.numpy as jnp
+
+Array = jax.Array
+
+# A finite "minus infinity": a row that is masked everywhere (padding) then gives a mean instead of NaN.
+MASKED = -1e30
+
+
+def split_heads(x: Array, heads: int) -> Array:
+    """(B, T, heads * D) -> (B, heads, T, D)."""
+    batch, length, width = x.shape
+    return x.reshape(batch, length, heads, width // heads).swapaxes(1, 2)
+
+
+def join_heads(x: Array) -> Array:
+    """(B, heads, T, D) -> (B, T, heads * D)."""
+    batch, heads, length, depth = x.shape
+    return x.swapaxes(1, 2).reshape(batch, length, heads * depth)
+
+
+def attend(query: Array, key: Array, value: Array, mask: Array | None = None, implementation: str = "by_hand") -> Array:
+    """Softmax attention, the softmax in float32.
+
+    query: (B, H, T, D). key, value: (B, Hkv, S, D), H a multiple of Hkv (grouped queries: query head h uses key head
+    h // (H / Hkv)). mask: bool, broadcastable to (B, T, S), True where a query may look; None for everywhere.
+    Returns (B, H, T, D) in the query's dtype.
+    """
+    batch, heads, length, depth = query.shape
+    kv_heads, keys = key.shape[1:3]
+    if implementation == "fused":
+        output = jax.nn.dot_product_attention(
+            query.swapaxes(1, 2),
+            key.swapaxes(1, 2),
+            value.swapaxes(1, 2),
+            mask=None if mask is None else mask[:, None],
+        )
+        return output.swapaxes(1, 2)
+    # The query heads that share a key head are laid out as more queries of it: two plain batched products.
+    grouped = (query * depth**-0.5).reshape(batch, kv_heads, -1, depth)
+    scores = jnp.einsum("bhtd,bhsd->bhts", grouped, key, preferred_element_type=jnp.float32)
+    if mask is not None:
+        scores = scores.reshape(batch, kv_heads, heads // kv_heads, length, keys)
+        scores = jnp.where(mask[:, None, None], scores, MASKED).reshape(batch, kv_heads, -1, keys)
+    weights = jax.nn.softmax(scores, axis=-1).astype(value.dtype)
+    return jnp.einsum("bhts,bhsd->bhtd", weights, value).reshape(batch, heads, length, depth)

@@ -1,0 +1,131 @@
+"""CLIP's vision transformer, eating 2D patches and 3D tokens in one sequence.
+
+Radford et al. 2021 (the architecture of openai/CLIP's ViT). The sequence is [CLS | 2D patches | 3D tokens]; a 3D token
+carries the positional embedding of the patch that its centre projects onto (2D-to-3D positional alignment), so the
+pretrained encoder needs no new parameters for it.
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from dsvla_jax.model.attention import attend, join_heads, split_heads
+from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.lora import KERNEL_INIT, LoraDense, residual_init
+
+Array = jax.Array
+
+
+def quick_gelu(x: Array) -> Array:
+    """x sigmoid(1.702 x), CLIP's approximation of GELU."""
+    return x * jax.nn.sigmoid(1.702 * x)
+
+
+def patchify(image: Array, patch_size: int) -> Array:
+    """(B, S, S, 3) -> (B, N, patch_size * patch_size * 3): row-major patches, row-major pixels within one."""
+    batch, size, _, channels = image.shape
+    grid = size // patch_size
+    patches = image.reshape(batch, grid, patch_size, grid, patch_size, channels).swapaxes(2, 3)
+    return patches.reshape(batch, grid * grid, patch_size * patch_size * channels)
+
+
+def layer_norm(epsilon: float, name: str) -> nn.LayerNorm:
+    """LayerNorm computed in float32."""
+    return nn.LayerNorm(epsilon=epsilon, dtype=jnp.float32, use_fast_variance=False, name=name)
+
+
+class VisionBlock(nn.Module):
+    """One pre-norm transformer layer: full attention, then a QuickGELU MLP."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, x: Array, _: None = None) -> tuple[Array, None]:
+        vision, dtype = self.config.vision, self.config.compute_dtype
+        options = {"use_bias": True, "lora": self.config.lora_for("vision"), "dtype": dtype}
+        into_residual = residual_init(vision.layers)
+
+        y = layer_norm(vision.norm_eps, "attention_norm")(x)
+        query, key, value = (split_heads(LoraDense(vision.width, name=n, **options)(y), vision.heads) for n in "qkv")
+        y = join_heads(attend(query, key, value, implementation=self.config.attention))
+        x = x + LoraDense(vision.width, kernel_init=into_residual, name="o", **options)(y)
+
+        y = layer_norm(vision.norm_eps, "mlp_norm")(x)
+        y = quick_gelu(LoraDense(vision.ffn, name="up", **options)(y))
+        x = x + LoraDense(vision.width, kernel_init=into_residual, name="down", **options)(y)
+        return x, None
+
+
+def over_layers(block, config: ModelConfig, layers: int, in_axes=nn.broadcast, out_axes=0):
+    """``block`` scanned over ``layers``: its variables get a leading layers axis; rematerialised as the config says."""
+    if config.remat != "none":
+        policy = jax.checkpoint_policies.dots_with_no_batch_dims_saveable if config.remat == "dots" else None
+        block = nn.remat(block, prevent_cse=False, policy=policy)
+    return nn.scan(
+        block,
+        variable_axes={"params": 0, "lora": 0},
+        split_rngs={"params": True},
+        in_axes=in_axes,
+        out_axes=out_axes,
+        length=layers,
+        unroll=config.scan_unroll,
+    )
+
+
+class VisionTower(nn.Module):
+    """image float32 (B, S, S, 3), point_tokens (B, G, D), point_patches int32 (B, G) -> (B, 1 + N + G, D).
+
+    G may be 0. The outputs are those of ``ln_post`` for every token, in the order [CLS | 2D | 3D].
+    """
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, image: Array, point_tokens: Array, point_patches: Array) -> Array:
+        vision, dtype = self.config.vision, self.config.compute_dtype
+        expected = (vision.image_size, vision.image_size, 3)
+        if image.shape[1:] != expected:
+            raise ValueError(
+                f"image: expected (B, {', '.join(map(str, expected))}), got {image.shape}; resize it in the encoding"
+            )
+        if point_tokens.shape[-1] != vision.width:
+            raise ValueError(
+                f"point_tokens: expected width {vision.width} (the vision tower's), got {point_tokens.shape[-1]}; set "
+                "the 3D tokenizer's width"
+            )
+        # A convolution whose stride is its kernel size is a product with flattened patches, and quicker as one.
+        kernel = self.param(
+            "patch_kernel",
+            nn.initializers.lecun_normal(in_axis=(0, 1, 2)),
+            (vision.patch_size,) * 2 + (3, vision.width),
+        )
+        embedding_init = nn.initializers.normal(vision.width**-0.5)
+        class_embedding = self.param("class_embedding", embedding_init, (vision.width,))
+        positions = self.param("positional_embedding", embedding_init, (1 + vision.num_patches, vision.width))
+
+        batch = image.shape[0]
+        patches = patchify(image, vision.patch_size).astype(dtype) @ kernel.reshape(-1, vision.width).astype(dtype)
+        tokens_2d = jnp.concatenate(
+            [jnp.broadcast_to(class_embedding, (batch, 1, vision.width)), patches.astype(jnp.float32)], axis=1
+        )
+        tokens_3d = point_tokens.astype(jnp.float32) + positions[1 + point_patches]
+        x = jnp.concatenate([tokens_2d + positions, tokens_3d], axis=1)
+
+        x = layer_norm(vision.norm_eps, "ln_pre")(x).astype(dtype)
+        x, _ = over_layers(VisionBlock, self.config, vision.layers)(self.config, name="layers")(x, None)
+        return layer_norm(vision.norm_eps, "ln_post")(x)
+
+
+class Projector(nn.Module):
+    """Vision outputs -> language width, LayerNorm last: the visual tokens of the prompt."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        width, dtype = self.config.language.width, self.config.compute_dtype
+        options = {"use_bias": True, "dtype": dtype, "kernel_init": KERNEL_INIT}
+        if self.config.projector == "mlp":
+            x = nn.gelu(LoraDense(width, name="hidden", **options)(x))
+        x = LoraDense(width, name="linear", **options)(x)
+        return layer_norm(1e-5, "norm")(x).astype(dtype)

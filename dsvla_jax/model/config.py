@@ -1,0 +1,148 @@
+"""Sizes and switches of the network. Plain frozen dataclasses: hashable, so a model is a valid static argument."""
+
+import dataclasses
+from typing import Literal
+
+import jax.numpy as jnp
+
+LORA_TARGETS = ("q", "k", "v", "o", "gate", "up", "down")
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclasses.dataclass(frozen=True)
+class VisionConfig:
+    """A CLIP vision transformer; the defaults are ViT-L/14 at 336 pixels."""
+
+    image_size: int = 336
+    patch_size: int = 14
+    width: int = 1024
+    layers: int = 24
+    heads: int = 16
+    mlp_ratio: float = 4.0
+    norm_eps: float = 1e-5
+
+    def __post_init__(self):
+        _require(
+            self.image_size % self.patch_size == 0,
+            f"vision: image_size {self.image_size} is not a multiple of patch_size {self.patch_size}",
+        )
+        _require(
+            self.width % self.heads == 0, f"vision: width {self.width} is not a multiple of its {self.heads} heads"
+        )
+
+    @property
+    def grid(self) -> int:
+        """Patches along one side of the image."""
+        return self.image_size // self.patch_size
+
+    @property
+    def num_patches(self) -> int:
+        return self.grid**2
+
+    @property
+    def ffn(self) -> int:
+        return round(self.width * self.mlp_ratio)
+
+
+@dataclasses.dataclass(frozen=True)
+class LanguageConfig:
+    """A LLaMA decoder; the defaults are LLaMA-7B."""
+
+    vocab_size: int = 32000
+    width: int = 4096
+    layers: int = 32
+    heads: int = 32
+    kv_heads: int = 32
+    ffn: int = 11008
+    rope_theta: float = 10000.0
+    norm_eps: float = 1e-6
+    tie_embeddings: bool = False
+
+    def __post_init__(self):
+        _require(
+            self.width % (2 * self.heads) == 0,
+            f"language: width {self.width} must be a multiple of 2 * heads = {2 * self.heads} (rotary halves)",
+        )
+        _require(
+            self.heads % self.kv_heads == 0,
+            f"language: heads {self.heads} is not a multiple of kv_heads {self.kv_heads}",
+        )
+
+    @property
+    def head_dim(self) -> int:
+        return self.width // self.heads
+
+
+@dataclasses.dataclass(frozen=True)
+class LoraConfig:
+    """Low-rank adapters: y = x W + (alpha / rank) x A B.
+
+    targets: which linear layers carry one. q, k, v, o of the attentions and up, down of the MLPs exist in both towers,
+        gate in the language model only.
+    towers: which towers carry them.
+    init: distribution of A. "kaiming" is uniform in +-1/sqrt(inputs), as peft's; "normal" has std 0.02. B is zero.
+    """
+
+    rank: int = 16
+    alpha: float = 16.0
+    targets: tuple[str, ...] = LORA_TARGETS
+    towers: tuple[str, ...] = ("vision", "language")
+    init: Literal["kaiming", "normal"] = "kaiming"
+
+    def __post_init__(self):
+        _require(self.rank > 0, f"lora: rank must be positive, got {self.rank}; use lora=None for no adapters")
+        for name, chosen, known in (
+            ("targets", self.targets, LORA_TARGETS),
+            ("towers", self.towers, ("vision", "language")),
+        ):
+            unknown = sorted(set(chosen) - set(known))
+            _require(not unknown, f"lora: unknown {name} {unknown}; choose from {list(known)}")
+
+    @property
+    def scale(self) -> float:
+        return self.alpha / self.rank
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """The assembled network.
+
+    point_width: width of a 3D token; the vision tower's width, because 3D tokens enter it as they are. None means that.
+    projector: vision width -> language width: a "linear" layer, or an "mlp" of two with GELU; LayerNorm follows.
+    lora: None for no adapters.
+    dtype: of matrix products and activations. Parameters, norms, softmax, rotations and logits are always float32.
+    remat: what the backward pass computes again, a layer at a time: "none", "full" (everything) or "dots" (all but
+        the results of products with weights).
+    attention: "by_hand" (two batched products over head-major arrays; the quickest on CPU) or "fused"
+        (jax.nn.dot_product_attention).
+    scan_unroll: layers per iteration of the loop over layers. Compile time grows with it, loop overhead shrinks.
+    """
+
+    vision: VisionConfig = VisionConfig()
+    language: LanguageConfig = LanguageConfig()
+    point_width: int | None = None
+    projector: Literal["linear", "mlp"] = "linear"
+    lora: LoraConfig | None = None
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    remat: Literal["none", "full", "dots"] = "none"
+    attention: Literal["by_hand", "fused"] = "by_hand"
+    scan_unroll: int = 1
+
+    def __post_init__(self):
+        _require(
+            self.point_width in (None, self.vision.width),
+            f"point_width {self.point_width} differs from the vision width {self.vision.width}: 3D tokens enter the "
+            f"vision tower unprojected, so set the 3D tokenizer's width to {self.vision.width}",
+        )
+
+    @property
+    def compute_dtype(self) -> jnp.dtype:
+        return jnp.dtype(self.dtype)
+
+    def lora_for(self, tower: str) -> LoraConfig | None:
+        """The adapters of one tower, None where it has none."""
+        return self.lora if self.lora is not None and tower in self.lora.towers else None

@@ -1,0 +1,134 @@
+"""A LLaMA decoder: RMSNorm, rotary positions (half-rotation layout), grouped-query attention, SwiGLU.
+
+Touvron et al. 2023; parameter layout and rotation as in Hugging Face's Llama.
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from dsvla_jax.model.attention import attend, join_heads, split_heads
+from dsvla_jax.model.clip import over_layers
+from dsvla_jax.model.config import LanguageConfig, ModelConfig
+from dsvla_jax.model.lora import LoraDense, residual_init
+
+Array = jax.Array
+
+
+@struct.dataclass
+class KVCache:
+    """Keys (rotated) and values of every layer: (layers, B, kv_heads, S, D), S slots in order of writing."""
+
+    keys: Array
+    values: Array
+
+    @classmethod
+    def empty(cls, config: ModelConfig, batch: int, slots: int) -> "KVCache":
+        language = config.language
+        shape = (language.layers, batch, language.kv_heads, slots, language.head_dim)
+        zeros = jnp.zeros(shape, config.compute_dtype)
+        return cls(zeros, zeros)
+
+
+class RMSNorm(nn.Module):
+    """x / rms(x) * scale over the last axis, in float32."""
+
+    epsilon: float
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        scale = self.param("scale", nn.initializers.ones_init(), (x.shape[-1],))
+        x = x.astype(jnp.float32)
+        return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + self.epsilon) * scale
+
+
+def rotary_tables(positions: Array, config: LanguageConfig) -> tuple[Array, Array]:
+    """Positions int32 (B, T) -> cosines and sines, float32 (B, 1, T, D / 2)."""
+    half = config.head_dim // 2
+    frequencies = config.rope_theta ** (-jnp.arange(half, dtype=jnp.float32) / half)
+    angles = positions[:, None, :, None].astype(jnp.float32) * frequencies
+    return jnp.cos(angles), jnp.sin(angles)
+
+
+def rotate(x: Array, tables: tuple[Array, Array]) -> Array:
+    """Rotate the pairs (x[i], x[i + D/2]) of (B, H, T, D) by their position's angle, in float32."""
+    cosine, sine = tables
+    first, second = jnp.split(x.astype(jnp.float32), 2, axis=-1)
+    return jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1).astype(x.dtype)
+
+
+class DecoderBlock(nn.Module):
+    """One layer. With a cache, keys and values are written at slot ``index`` and the queries look at all its slots."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(
+        self, x: Array, tables: tuple[Array, Array], mask: Array, cache: KVCache | None, index: Array | int
+    ) -> tuple[Array, KVCache | None]:
+        language, dtype = self.config.language, self.config.compute_dtype
+        options = {"lora": self.config.lora_for("language"), "dtype": dtype}
+        into_residual = residual_init(language.layers)
+        kv_width = language.kv_heads * language.head_dim
+
+        y = RMSNorm(language.norm_eps, name="attention_norm")(x)
+        query = rotate(split_heads(LoraDense(language.width, name="q", **options)(y), language.heads), tables)
+        key = rotate(split_heads(LoraDense(kv_width, name="k", **options)(y), language.kv_heads), tables)
+        value = split_heads(LoraDense(kv_width, name="v", **options)(y), language.kv_heads)
+        if cache is not None:
+            key = jax.lax.dynamic_update_slice_in_dim(cache.keys, key, index, axis=2)
+            value = jax.lax.dynamic_update_slice_in_dim(cache.values, value, index, axis=2)
+            cache = KVCache(key, value)
+        y = join_heads(attend(query, key, value, mask, self.config.attention))
+        x = x + LoraDense(language.width, kernel_init=into_residual, name="o", **options)(y)
+
+        y = RMSNorm(language.norm_eps, name="mlp_norm")(x)
+        gate = LoraDense(language.ffn, name="gate", **options)(y)
+        up = LoraDense(language.ffn, name="up", **options)(y)
+        y = jax.nn.silu(gate) * up
+        x = x + LoraDense(language.width, kernel_init=into_residual, name="down", **options)(y)
+        return x, cache
+
+
+class Llama(nn.Module):
+    """Embeddings in, normalised hidden states out; ``embed`` and ``lm_head`` are the two ends."""
+
+    config: ModelConfig
+
+    def setup(self):
+        language = self.config.language
+        # Unit-norm rows: with tied weights the first logits then have unit variance.
+        self.embedding = self.param(
+            "embedding", nn.initializers.normal(language.width**-0.5), (language.vocab_size, language.width)
+        )
+        self.layers = over_layers(
+            DecoderBlock, self.config, language.layers, in_axes=(nn.broadcast, nn.broadcast, 0, nn.broadcast)
+        )(self.config)
+        self.norm = RMSNorm(language.norm_eps)
+        if not language.tie_embeddings:
+            self.output = self.param(
+                "output", nn.initializers.normal(language.width**-0.5), (language.width, language.vocab_size)
+            )
+
+    def embed(self, tokens: Array) -> Array:
+        """int32 (B, T) -> (B, T, width)."""
+        return self.embedding[tokens].astype(self.config.compute_dtype)
+
+    def __call__(
+        self, x: Array, positions: Array, mask: Array, cache: KVCache | None = None, index: Array | int = 0
+    ) -> tuple[Array, KVCache | None]:
+        """x (B, T, width), positions int32 (B or 1, T), mask bool (B or 1, T, S) -> hidden (B, T, width), new cache.
+
+        Without a cache S is T. With one, its S slots are attended to, after slots index..index+T-1 are overwritten.
+        """
+        tables = rotary_tables(positions, self.config.language)
+        x, cache = self.layers(x, tables, mask, cache, index)
+        return self.norm(x).astype(self.config.compute_dtype), cache
+
+    def lm_head(self, hidden: Array) -> Array:
+        """(..., width) -> float32 logits (..., V)."""
+        language, dtype = self.config.language, self.config.compute_dtype
+        if language.tie_embeddings:
+            return jnp.einsum("...d,vd->...v", hidden, self.embedding.astype(dtype), preferred_element_type=jnp.float32)
+        return jnp.einsum("...d,dv->...v", hidden, self.output.astype(dtype), preferred_element_type=jnp.float32)

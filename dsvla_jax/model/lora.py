@@ -1,0 +1,97 @@
+"""A linear layer that may carry a low-rank adapter, and the algebra of adapters.
+
+The base weights live in the collection "params", the adapters in "lora", at the same path:
+params/.../kernel (in, out) beside lora/.../a (in, rank) and lora/.../b (rank, out); a leading layers axis where the
+layer is scanned over. Freezing, saving adapters alone and merging are therefore tree operations.
+Hu et al. 2021, "LoRA: Low-Rank Adaptation of Large Language Models", equation 3.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import traverse_util
+
+from dsvla_jax.model.config import LoraConfig
+
+Array = jax.Array
+Initializer = Any
+
+KERNEL_INIT = nn.initializers.lecun_normal()
+
+
+def residual_init(layers: int) -> Initializer:
+    """Kernels that write into a residual stream which 2 * layers of them add to, so that its variance stays bounded."""
+    return nn.initializers.variance_scaling(1.0 / (2 * layers), "fan_in", "truncated_normal")
+
+
+def _adapter_init(kind: str) -> Initializer:
+    if kind == "normal":
+        return nn.initializers.normal(0.02)
+    return nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
+
+
+class LoraDense(nn.Module):
+    """y = x W + b + (alpha / rank) x A B over the last axis of x.
+
+    The adapter is used when the variables hold one; merged weights have none, and run through the same module.
+    """
+
+    features: int
+    use_bias: bool = False
+    lora: LoraConfig | None = None
+    dtype: Any = jnp.float32
+    kernel_init: Initializer = KERNEL_INIT
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        inputs = x.shape[-1]
+        x = x.astype(self.dtype)
+        kernel = self.param("kernel", self.kernel_init, (inputs, self.features), jnp.float32)
+        y = x @ kernel.astype(self.dtype)
+        if self.use_bias:
+            bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
+            y = y + bias.astype(self.dtype)
+        lora = self.lora
+        present = self.is_initializing() or self.has_variable("lora", "a")
+        if lora is not None and self.name in lora.targets and present:
+            a_init = _adapter_init(lora.init)
+            a = self.variable("lora", "a", lambda: a_init(self.make_rng("params"), (inputs, lora.rank), jnp.float32))
+            b = self.variable("lora", "b", lambda: jnp.zeros((lora.rank, self.features), jnp.float32))
+            y = y + (x @ a.value.astype(self.dtype)) @ b.value.astype(self.dtype) * lora.scale
+        return y
+
+
+def _add_adapters(params: Mapping, adapters: Mapping, scale: float) -> dict:
+    flat = dict(traverse_util.flatten_dict(params))
+    flat_adapters = traverse_util.flatten_dict(adapters)
+    for path in flat_adapters:
+        if path[-1] != "a":
+            continue
+        kernel_path = (*path[:-1], "kernel")
+        if kernel_path not in flat:
+            raise ValueError(
+                f"adapter {'/'.join(map(str, path[:-1]))} has no kernel in the base weights: adapters and base weights "
+                "come from different models"
+            )
+        a, b = flat_adapters[path], flat_adapters[(*path[:-1], "b")]
+        kernel = flat[kernel_path]
+        delta = scale * jnp.matmul(a.astype(jnp.float32), b.astype(jnp.float32), precision="highest")
+        if delta.shape != kernel.shape:
+            raise ValueError(
+                f"adapter {'/'.join(map(str, path[:-1]))}: A B has shape {delta.shape}, the kernel {kernel.shape}"
+            )
+        flat[kernel_path] = (kernel.astype(jnp.float32) + delta).astype(kernel.dtype)
+    return traverse_util.unflatten_dict(flat)
+
+
+def merge_lora(variables: Mapping, lora: LoraConfig) -> dict:
+    """Add the adapters to the base weights: {"params", "lora"} -> {"params"} of the same outputs without adapters."""
+    return {"params": _add_adapters(variables["params"], variables.get("lora", {}), lora.scale)}
+
+
+def unmerge_lora(merged: Mapping, adapters: Mapping, lora: LoraConfig) -> dict:
+    """Inverse of ``merge_lora`` given the tree of adapters: {"params"} -> {"params", "lora"}. Exact up to rounding."""
+    return {"params": _add_adapters(merged["params"], adapters, -lora.scale), "lora": adapters}

@@ -1,0 +1,129 @@
+"""The assembled policy network: vision tower -> projector -> visual tokens before the text -> LLaMA -> logits."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dsvla_jax.model.clip import Projector, VisionTower
+from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.llama import KVCache, Llama
+from dsvla_jax.types import ModelInputs
+
+Array = jax.Array
+
+# Shortest and longest wavelength of the number embeddings, in integers. The shortest tells neighbours apart, the
+# longest is twice the span of all numbers (-100..200), so that its phase never repeats.
+NUMBER_WAVELENGTHS = (4.0, 600.0)
+
+
+class VLA(nn.Module):
+    """``VLA(config).apply(variables, inputs)`` with batched ``ModelInputs`` -> float32 logits (B, T, V).
+
+    The language model reads [visual tokens | text], all causal. Logits are returned for the text positions: position t
+    predicts text token t + 1. Text is padded at its end, so causality alone keeps padding out of every valid position.
+    """
+
+    config: ModelConfig
+
+    def setup(self):
+        self.vision = VisionTower(self.config)
+        self.projector = Projector(self.config)
+        self.language = Llama(self.config)
+
+    def encode_vision(self, inputs: ModelInputs) -> Array:
+        """The vision tower's outputs (B, 1 + N + G, vision width), ordered [CLS | 2D | 3D]."""
+        return self.vision(inputs.image, inputs.point_tokens, inputs.point_patches)
+
+    def hidden(self, inputs: ModelInputs, text_from: int = 0) -> Array:
+        """Hidden states (B, T - text_from, width) of the text positions from ``text_from`` on."""
+        x, positions = self._sequence(inputs)
+        mask = positions[:, :, None] >= positions[:, None, :]
+        x, _ = self.language(x, positions, mask)
+        return x[:, x.shape[1] - inputs.text_tokens.shape[1] + text_from :]
+
+    def lm_head(self, hidden: Array) -> Array:
+        """(..., width) -> float32 (..., V). Apply it to chosen hidden states where the vocabulary is large."""
+        return self.language.lm_head(hidden)
+
+    def __call__(self, inputs: ModelInputs, text_from: int = 0) -> Array:
+        """Logits float32 (B, T - text_from, V)."""
+        return self.lm_head(self.hidden(inputs, text_from))
+
+    def prefill(self, inputs: ModelInputs, more_slots: int) -> tuple[Array, KVCache]:
+        """Read visual tokens and text into a fresh cache with ``more_slots`` unused slots at its end.
+
+        Returns the logits (B, V) after each example's last valid text token, and the cache.
+        """
+        x, positions = self._sequence(inputs)
+        batch, length, _ = x.shape
+        cache = KVCache.empty(self.config, batch, length + more_slots)
+        mask = positions[:, :, None] >= jnp.arange(length + more_slots)[None, None, :]
+        x, cache = self.language(x, positions, mask, cache, 0)
+        text_lengths = inputs.text_mask.sum(axis=1)
+        last = length - inputs.text_tokens.shape[1] + text_lengths - 1
+        hidden = jnp.take_along_axis(x, last[:, None, None], axis=1)[:, 0]
+        return self.lm_head(hidden), cache
+
+    def extend(
+        self, tokens: Array, positions: Array, mask: Array, cache: KVCache, index: Array | int
+    ) -> tuple[Array, KVCache]:
+        """Read tokens int32 (B, C) at rotary ``positions`` (B, C) into the slots from ``index`` on.
+
+        mask: bool (B, C, S), the slots each token may look at. Returns the logits (B, V) after the last of them.
+        """
+        x, cache = self.language(self.language.embed(tokens), positions, mask, cache, index)
+        return self.lm_head(x[:, -1]), cache
+
+    def _sequence(self, inputs: ModelInputs) -> tuple[Array, Array]:
+        visual = self.projector(self.encode_vision(inputs))
+        x = jnp.concatenate([visual, self.language.embed(inputs.text_tokens)], axis=1)
+        return x, jnp.arange(x.shape[1])[None]
+
+
+def number_embeddings(values: Array, width: int) -> Array:
+    """Fourier features of numbers, (V,) -> (V, width), every row of mean square 1.
+
+    Half sines, half cosines, at wavelengths that grow geometrically over ``NUMBER_WAVELENGTHS``: the inner product of
+    two rows depends on their difference only and falls off smoothly with it.
+    """
+    half = width // 2
+    wavelengths = jnp.geomspace(*NUMBER_WAVELENGTHS, half)
+    angles = 2 * jnp.pi * values[:, None] / wavelengths
+    features = jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1) * 2**0.5
+    return jnp.pad(features, ((0, 0), (0, width - 2 * half)))
+
+
+def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Array | None = None) -> dict:
+    """Random variables {"params", and "lora" where the config has adapters}. Pure: may be jitted with shardings.
+
+    number_values: float32 (V,), the value of each token that is a number, NaN elsewhere. Given, those tokens' rows of
+        the embedding (and of an untied output) start as Fourier features of their value, at the scale of the others,
+        so that near numbers start near. Without it numbers are as random as words.
+    """
+    vision, language = config.vision, config.language
+    inputs = ModelInputs(
+        image=jnp.zeros((1, vision.image_size, vision.image_size, 3)),
+        point_tokens=jnp.zeros((1, 1, vision.width)),
+        point_patches=jnp.zeros((1, 1), jnp.int32),
+        text_tokens=jnp.zeros((1, 2), jnp.int32),
+        text_mask=jnp.ones((1, 2), bool),
+    )
+    variables = jax.jit(VLA(config).init)(key, inputs)
+    if number_values is None:
+        return variables
+    values = jnp.asarray(number_values, jnp.float32)
+    if values.shape != (language.vocab_size,):
+        raise ValueError(
+            f"number_values: expected ({language.vocab_size},), one for each token of the vocabulary, "
+            f"got {values.shape}"
+        )
+    is_number = ~jnp.isnan(values)[:, None]
+    features = number_embeddings(jnp.nan_to_num(values), language.width) * language.width**-0.5
+    params = dict(variables["params"])
+    tables = dict(params["language"])
+    tables["embedding"] = jnp.where(is_number, features, tables["embedding"])
+    if not language.tie_embeddings:
+        tables["output"] = jnp.where(is_number.T, features.T, tables["output"])
+    params["language"] = tables
+    return {**variables, "params": params}

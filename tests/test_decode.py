@@ -1,0 +1,145 @@
+"""Decoding: the cache against the full forward pass, independence of batch-mates, well-formed answers."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
+from dsvla_jax.model.decode import decode_actions, make_decoder
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.types import ModelInputs
+
+VOCAB = 40
+EOS = 2
+CONFIG = ModelConfig(
+    vision=VisionConfig(image_size=16, patch_size=8, width=32, layers=1, heads=4),
+    language=LanguageConfig(vocab_size=VOCAB, width=32, layers=2, heads=4, kv_heads=2, ffn=48),
+    lora=LoraConfig(rank=2, alpha=5.0),
+)
+# Template tokens in front, single and double ones between free slots, adjacent free slots, and the end.
+FORCED = np.array([5, 6, -1, 7, -1, 7, -1, 8, 9, -1, -1, EOS], np.int32)
+PROMPT_LENGTHS = np.array([9, 4, 1])
+
+
+def make_grammar(forced=FORCED, seed=0):
+    allowed = np.random.default_rng(seed).random((len(forced), VOCAB)) < 0.4
+    return SimpleNamespace(forced=forced, allowed=allowed)
+
+
+def make_prompts(lengths=PROMPT_LENGTHS, padded=9, seed=0) -> ModelInputs:
+    rng = np.random.default_rng(seed)
+    batch = len(lengths)
+    return ModelInputs(
+        image=jnp.asarray(rng.normal(size=(batch, 16, 16, 3)), jnp.float32),
+        point_tokens=jnp.asarray(rng.normal(size=(batch, 3, 32)), jnp.float32),
+        point_patches=jnp.asarray(rng.integers(0, 4, (batch, 3)), jnp.int32),
+        text_tokens=jnp.asarray(rng.integers(10, VOCAB, (batch, padded)), jnp.int32),
+        text_mask=jnp.arange(padded)[None] < jnp.asarray(lengths)[:, None],
+    )
+
+
+@pytest.fixture(scope="module")
+def variables():
+    variables = initialize(CONFIG, jax.random.key(0))
+    keys = jax.random.key(7)
+    return {
+        "params": jax.tree.map(lambda x: x * 2.0, variables["params"]),
+        "lora": jax.tree.map(lambda x: x + 0.1 * jax.random.normal(keys, x.shape), variables["lora"]),
+    }
+
+
+def teacher_forced_logits(variables, prompts, answers):
+    """The full forward pass over prompt + answer: logits (B, L, V) that predict each answer token."""
+    lengths = np.asarray(prompts.text_mask.sum(axis=1))
+    texts = np.zeros((len(lengths), lengths.max() + answers.shape[1]), np.int32)
+    for row, prompt, length, answer in zip(texts, np.asarray(prompts.text_tokens), lengths, answers, strict=True):
+        row[: length + len(answer)] = [*prompt[:length], *answer]
+    inputs = prompts.replace(text_tokens=jnp.asarray(texts), text_mask=jnp.ones(texts.shape, bool))
+    logits = jax.jit(VLA(CONFIG).apply)(variables, inputs)
+    return jnp.stack([row[n - 1 : n - 1 + answers.shape[1]] for row, n in zip(logits, lengths, strict=True)])
+
+
+@pytest.mark.parametrize("forced", [FORCED, np.array([-1, -1, 4, -1, 4, -1], np.int32)])
+def test_decoding_is_the_greedy_choice_of_the_full_forward_pass(variables, forced):
+    grammar, prompts = make_grammar(forced), make_prompts()
+    tokens, log_probs = make_decoder(VLA(CONFIG), grammar)(variables, prompts)
+    logits = teacher_forced_logits(variables, prompts, tokens)
+    masked = jnp.where(grammar.allowed, logits, -jnp.inf)
+    expected = jnp.where(forced >= 0, forced, masked.argmax(axis=-1))
+    np.testing.assert_array_equal(tokens, expected)
+    reference = jnp.take_along_axis(jax.nn.log_softmax(masked), tokens[..., None], axis=-1)[..., 0]
+    np.testing.assert_allclose(log_probs, jnp.where(forced >= 0, 0.0, reference), atol=1e-4)
+
+
+def test_prefill_and_extend_give_the_logits_of_the_full_forward_pass(variables):
+    model, prompts = VLA(CONFIG), make_prompts(np.array([9, 9]))
+    full = jax.jit(model.apply)(variables, prompts)
+    extend = jax.jit(lambda *args: model.apply(variables, *args, method="extend"))
+    head = prompts.replace(text_tokens=prompts.text_tokens[:, :4], text_mask=prompts.text_mask[:, :4])
+    logits, cache = jax.jit(lambda head: model.apply(variables, head, 5, method="prefill"))(head)
+    np.testing.assert_allclose(logits, full[:, 3], atol=1e-4)
+    slots = cache.keys.shape[3]
+    start = slots - 5
+    for first, count in ((4, 2), (6, 1), (7, 1)):
+        positions = start - 4 + first + jnp.arange(count)[None].repeat(2, axis=0)
+        mask = jnp.arange(slots) <= positions[..., None]
+        chunk = prompts.text_tokens[:, first : first + count]
+        logits, cache = extend(chunk, positions, mask, cache, start - 4 + first)
+        np.testing.assert_allclose(logits, full[:, first + count - 1], atol=1e-4)
+
+
+def test_padding_and_batch_mates_never_change_an_answer(variables):
+    grammar, prompts = make_grammar(), make_prompts()
+    decode = make_decoder(VLA(CONFIG), grammar)
+    tokens, log_probs = decode(variables, prompts)
+    for b, length in list(enumerate(PROMPT_LENGTHS))[1:]:
+        alone = jax.tree.map(lambda x, b=b: x[b : b + 1], prompts)
+        alone = alone.replace(text_tokens=alone.text_tokens[:, :length], text_mask=alone.text_mask[:, :length])
+        lonely_tokens, lonely_log_probs = decode(variables, alone)
+        np.testing.assert_array_equal(lonely_tokens[0], tokens[b])
+        np.testing.assert_allclose(lonely_log_probs[0], log_probs[b], atol=1e-4)
+    # What stands in the padding is never read.
+    scribbled = prompts.replace(text_tokens=jnp.where(prompts.text_mask, prompts.text_tokens, 3))
+    np.testing.assert_array_equal(decode(variables, scribbled)[1], log_probs)
+    # Other batch-mates, same shapes: the very same numbers.
+    others = jax.tree.map(lambda x, y: x.at[1:].set(y[1:]), prompts, make_prompts(seed=5))
+    np.testing.assert_array_equal(decode(variables, others)[0][0], tokens[0])
+    np.testing.assert_array_equal(decode(variables, others)[1][0], log_probs[0])
+
+
+def test_a_thousand_decodes_of_random_weights_follow_the_grammar(variables):
+    grammar = make_grammar()
+    decode = make_decoder(VLA(CONFIG), grammar)
+    seen = set()
+    for seed in range(4):
+        lengths = np.random.default_rng(seed).integers(1, 10, 250)
+        weights = jax.tree.map(lambda x, s=seed: x * (1.0 + s), variables)
+        tokens = np.asarray(decode(weights, make_prompts(lengths, seed=seed))[0])
+        template = FORCED >= 0
+        assert (tokens[:, template] == FORCED[template]).all()
+        for slot in np.flatnonzero(~template):
+            assert grammar.allowed[slot, tokens[:, slot]].all()
+        seen.update(map(tuple, tokens))
+    assert len(seen) > 50
+
+
+def test_a_template_without_free_slots_costs_nothing():
+    tokens, log_probs = decode_actions(VLA(CONFIG), {}, make_prompts(), make_grammar(np.array([4, 5, EOS])))
+    np.testing.assert_array_equal(tokens, np.tile([4, 5, EOS], (3, 1)))
+    assert not log_probs.any()
+
+
+@pytest.mark.parametrize(
+    ("grammar", "message"),
+    [
+        (SimpleNamespace(forced=np.array([-1]), allowed=np.ones((1, 7), bool)), "vocabulary of 7 tokens"),
+        (SimpleNamespace(forced=np.array([-1]), allowed=np.zeros((1, VOCAB), bool)), r"free slots \[0\]"),
+        (SimpleNamespace(forced=np.array([-1]), allowed=np.ones((2, VOCAB), bool)), "expected forced"),
+    ],
+)
+def test_impossible_grammars_say_why(variables, grammar, message):
+    with pytest.raises(ValueError, match=message):
+        decode_actions(VLA(CONFIG), variables, make_prompts(), grammar)
