@@ -1,0 +1,162 @@
+"""The one path from an observation and words to the network's inputs."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from dsvla_jax.encoding.alignment import AlignmentMode, align_to_patches
+from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.encoding.farthest_point import farthest_point_sample
+from dsvla_jax.encoding.point_cloud import cloud_from_depth
+from dsvla_jax.encoding.point_tokens import PointTokenizerConfig, tokenize_points
+from dsvla_jax.encoding.prompts import Style, format_prompt
+from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.types import Array, Observation
+
+# The normalisation CLIP was trained with (https://github.com/openai/CLIP).
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+
+
+@dataclasses.dataclass(frozen=True)
+class EncodingConfig:
+    """Everything between an observation and the network; hashable, so it can be a static argument of jit.
+
+    Attributes:
+        image_size, patch_size: of the square image the network sees, pixels.
+        points: the 3D tokenizer.
+        stride: every how many pixels a depth map gives a candidate point.
+        workspace_low, workspace_high: the box of the cloud, metres, world frame. The default floor is just above the
+            table top, which would otherwise take most of the points.
+        alignment: how 3D tokens get their positional embedding.
+        style: of the prompt and answer text.
+        max_text_length: T, tokens of prompt and answer with begin and end.
+        codec: poses as integers.
+        use_keypoints: False drops the keypoint constraint from the prompt.
+        use_points: False drops the 3D tokens (G = 0).
+    """
+
+    image_size: int = 336
+    patch_size: int = 14
+    points: PointTokenizerConfig = dataclasses.field(default_factory=PointTokenizerConfig)
+    stride: int = 2
+    workspace_low: tuple[float, float, float] = (-1.5, -1.5, 0.76)
+    workspace_high: tuple[float, float, float] = (1.5, 1.5, 3.0)
+    alignment: AlignmentMode = "aligned"
+    style: Style = "paper"
+    max_text_length: int = 512
+    codec: PoseCodec = dataclasses.field(default_factory=PoseCodec)
+    use_keypoints: bool = True
+    use_points: bool = True
+
+    def __post_init__(self):
+        if self.image_size % self.patch_size:
+            raise ValueError(f"image_size: expected a multiple of patch_size {self.patch_size}, got {self.image_size}")
+
+    @property
+    def grid(self) -> int:
+        """Patches along a side of the image."""
+        return self.image_size // self.patch_size
+
+    @property
+    def num_point_tokens(self) -> int:
+        """G."""
+        return self.points.num_tokens if self.use_points else 0
+
+
+def encode_observation(observation: Observation, config: EncodingConfig) -> dict[str, Array]:
+    """The picture's part of ModelInputs, for a batch.
+
+    Args:
+        observation: every leaf with a leading batch axis B. The image may have any size; its camera describes it.
+
+    Returns:
+        image: float32 (B, S, S, 3), normalised as CLIP's. point_tokens: float32 (B, G, D3).
+        point_patches: int32 (B, G). Keyword arguments of ModelInputs.
+    """
+    image = normalize_image(observation.rgb, config.image_size)
+    batch, height, width = image.shape[0], observation.depth.shape[1], observation.depth.shape[2]
+    if not config.use_points:
+        tokens = jnp.zeros((batch, 0, config.points.width), jnp.float32)
+        return {"image": image, "point_tokens": tokens, "point_patches": jnp.zeros((batch, 0), jnp.int32)}
+    cloud = jax.vmap(
+        lambda depth, camera: cloud_from_depth(
+            depth, camera, config.workspace_low, config.workspace_high, config.stride
+        )
+    )
+    points, valid = cloud(observation.depth, observation.camera)
+    if points.shape[1] < config.points.num_points:
+        raise ValueError(
+            f"a {height} x {width} depth map with stride {config.stride} has {points.shape[1]} points, fewer than "
+            f"num_points {config.points.num_points}; lower one of stride and num_points or use a larger image"
+        )
+    chosen = farthest_point_sample(points, valid, config.points.num_points)
+    points = jnp.take_along_axis(points, chosen[..., None], axis=1)
+    tokens, centers = jax.vmap(lambda one: tokenize_points(one, config.points))(points)
+    patches = jax.vmap(lambda one, camera: align_to_patches(one, camera, height, width, config.grid, config.alignment))(
+        centers, observation.camera
+    )
+    return {"image": image, "point_tokens": tokens, "point_patches": patches}
+
+
+def normalize_image(rgb: ArrayLike, size: int) -> Array:
+    """uint8 (B, H, W, 3) -> float32 (B, size, size, 3): bicubic resize where the size differs, then CLIP's scaling."""
+    rgb = jnp.asarray(rgb)
+    if rgb.ndim != 4 or rgb.shape[-1] != 3 or rgb.dtype != jnp.uint8:
+        raise ValueError(f"rgb: expected a batch of uint8 images (B, H, W, 3), got {rgb.dtype} {rgb.shape}")
+    image = rgb.astype(jnp.float32) / 255.0
+    if image.shape[1:3] != (size, size):
+        image = jnp.clip(jax.image.resize(image, (image.shape[0], size, size, 3), "bicubic"), 0.0, 1.0)
+    return (image - jnp.array(CLIP_MEAN, jnp.float32)) / jnp.array(CLIP_STD, jnp.float32)
+
+
+def build_prompt(
+    config: EncodingConfig,
+    instruction: str,
+    pose: ArrayLike,
+    gripper_open: ArrayLike,
+    keypoints: ArrayLike | None,
+) -> str:
+    """The question of one step, on the host.
+
+    Args:
+        pose: float (A, 7). gripper_open: float (A,). The robot's own state.
+        keypoints: float (A, 3), metres, world frame: the active keypoint of each arm, or None where there is none.
+    """
+    state = config.codec.encode(np.asarray(pose), np.asarray(gripper_open))
+    integers = None
+    if config.use_keypoints and keypoints is not None:
+        integers = config.codec.encode_position(np.asarray(keypoints))
+    return format_prompt(instruction, state, integers, config.style)
+
+
+def encode_text(
+    tokenizer: Tokenizer, prompt: str, answer: str | None, max_length: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Prompt and answer as padded tokens, on the host.
+
+    Prompt and answer are tokenised apart, so a prompt's tokens never depend on its answer.
+
+    Args:
+        answer: None at inference; then the text ends with the prompt, without the end-of-sequence token.
+
+    Returns:
+        tokens: int32 (T,), begin, prompt [, answer, end], padding. mask: bool (T,), False on padding.
+        answer_mask: bool (T,), True on the answer's tokens and its end: what the policy is to write.
+    """
+    tokens = [tokenizer.bos_id, *tokenizer.encode(prompt)]
+    start = len(tokens)
+    if answer is not None:
+        tokens += [*tokenizer.encode(answer), tokenizer.eos_id]
+    length = len(tokens)
+    if length > max_length:
+        raise ValueError(
+            f"text: {length} tokens are more than max_text_length {max_length}; raise it, or shorten {prompt!r}"
+        )
+    padded = np.full(max_length, tokenizer.pad_id, np.int32)
+    padded[:length] = tokens
+    place = np.arange(max_length)
+    return padded, place < length, (place >= start) & (place < length)
