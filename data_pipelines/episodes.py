@@ -27,15 +27,17 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_shard(folder: Path, name: str, episodes: Sequence[Episode], **extra: Any) -> dict[str, Any]:
-    """Writes one shard (all episodes of one task) under its final name only once complete; returns its index entry.
+def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode], **extra: Any) -> dict[str, Any]:
+    """Writes one shard under its final name only once it is complete; returns its index entry.
 
-    `extra` is kept in the entry: the writer's own notes, which readers ignore.
+    episodes: of one task; may be empty. `extra` is kept in the entry: the writer's own notes, which readers ignore.
     """
     folder.mkdir(parents=True, exist_ok=True)
     kinds = {(episode.task, episode.num_arms) for episode in episodes}
-    if len(kinds) > 1:
-        raise ValueError(f"shard {name}: expected episodes of one task, got {sorted(kinds)}; write one shard a task")
+    if len(kinds) > 1 or any(kind[0] != task for kind in kinds):
+        raise ValueError(
+            f"shard {name}: expected episodes of {task} alike, got {sorted(kinds)}; write one shard a task"
+        )
     temporary = folder / f"{name}.partial"
     # The pictures are compressed already; one record a chunk makes random access cheap.
     writer = array_record_module.ArrayRecordWriter(str(temporary), "group_size:1,uncompressed")
@@ -44,7 +46,7 @@ def write_shard(folder: Path, name: str, episodes: Sequence[Episode], **extra: A
     writer.close()
     entry = {
         "file": name,
-        "task": episodes[0].task if episodes else "",
+        "task": task,
         "num_arms": episodes[0].num_arms if episodes else 0,
         "frames": [episode.num_frames for episode in episodes],
         "bytes": temporary.stat().st_size,
@@ -109,7 +111,7 @@ def write_episodes(folder: Path | str, episodes: Iterable[Episode], per_shard: i
     for task, group in sorted(by_task.items()):
         for start in range(0, len(group), per_shard):
             name = f"{task}-{start // per_shard:05d}.array_record"
-            shards.append(write_shard(folder, name, group[start : start + per_shard]))
+            shards.append(write_shard(folder, name, task, group[start : start + per_shard]))
     write_index(folder, shards)
 
 

@@ -7,10 +7,12 @@ import json
 import pickle
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from data_pipelines import augment
+from data_pipelines.demos import ScriptedExpert, Settings, generate_demonstrations, mark_missing, replay_latch
 from data_pipelines.episodes import EpisodeReader, write_episodes
 from data_pipelines.loader import make_loader
 from data_pipelines.records import (
@@ -25,6 +27,7 @@ from data_pipelines.records import (
     unpack_episode,
 )
 from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.types import Action
 
 
 def random_episode(seed, task="lamp_on", arms=1, frames=3, size=8):
@@ -283,3 +286,121 @@ def test_episode_keys_depend_on_the_number_alone():
     assert len({tuple(key) for key in every.tolist()}) == len(every)
     with pytest.raises(ValueError, match="split: expected one of"):
         episode_keys(0, "test", "lamp_on", 0, 1)
+
+
+class FakeExpert:
+    """Every third attempt fails; stops the run at a given attempt."""
+
+    def __init__(self, interrupt_at=None):
+        self.interrupt_at = interrupt_at
+        self.starts = []
+
+    def __call__(self, task, settings):
+        def demonstrate(start, count):
+            if start == self.interrupt_at:
+                raise KeyboardInterrupt
+            self.starts.append((task, start))
+            return [None if i % 3 == 0 else random_episode(i, task=task) for i in range(start, start + count)]
+
+        return demonstrate
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_generation_replaces_failures_and_is_deterministic(tmp_path):
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        generate_demonstrations(folder, ["lamp_on"], 10, demonstrator=FakeExpert(), batch=4, progress=False)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    reader = EpisodeReader(tmp_path / "a")
+    assert [reader.episode(i).seed for i in range(10)] == [1, 2, 4, 5, 7, 8, 10, 11, 13, 14]
+    assert len(reader) == 10
+
+
+def test_interrupted_generation_continues_where_it_stopped(tmp_path):
+    tasks = ["lamp_on", "close_fridge"]
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    generate_demonstrations(whole, tasks, 8, demonstrator=FakeExpert(), batch=4, progress=False)
+    with pytest.raises(KeyboardInterrupt):
+        generate_demonstrations(parts, tasks, 8, demonstrator=FakeExpert(interrupt_at=8), batch=4, progress=False)
+    # A file that was being written when the program stopped.
+    (parts / "lamp_on-00002.array_record").write_bytes(b"half")
+    rest = FakeExpert()
+    generate_demonstrations(parts, tasks, 8, demonstrator=rest, batch=4, progress=False)
+    assert rest.starts == [("lamp_on", 8), ("close_fridge", 0), ("close_fridge", 4), ("close_fridge", 8)]
+    assert contents(parts) == contents(whole)
+    rest = FakeExpert()
+    generate_demonstrations(parts, tasks, 8, demonstrator=rest, batch=4, progress=False)
+    assert rest.starts == []
+
+
+def test_more_episodes_and_damaged_shards_are_made_again(tmp_path):
+    small, large = tmp_path / "small", tmp_path / "large"
+    generate_demonstrations(large, ["lamp_on"], 9, demonstrator=FakeExpert(), batch=4, progress=False)
+    generate_demonstrations(small, ["lamp_on"], 4, demonstrator=FakeExpert(), batch=4, progress=False)
+    more = FakeExpert()
+    generate_demonstrations(small, ["lamp_on"], 9, demonstrator=more, batch=4, progress=False)
+    assert contents(small) == contents(large)
+    assert more.starts == [("lamp_on", 4), ("lamp_on", 8), ("lamp_on", 12)]
+    shard = small / "lamp_on-00001.array_record"
+    shard.write_bytes(shard.read_bytes()[:1000])
+    again = FakeExpert()
+    generate_demonstrations(small, ["lamp_on"], 9, demonstrator=again, batch=4, progress=False)
+    assert again.starts == [("lamp_on", 4)]
+    assert contents(small) == contents(large)
+
+
+def test_generation_refuses_other_settings_and_a_broken_expert(tmp_path):
+    generate_demonstrations(tmp_path, ["lamp_on"], 2, demonstrator=FakeExpert(), batch=4, progress=False)
+    with pytest.raises(DataError, match=r"index.json: settings.seed: expected 1 as asked for, got 0; choose"):
+        generate_demonstrations(tmp_path, ["lamp_on"], 2, demonstrator=FakeExpert(), batch=4, seed=1, progress=False)
+
+    def hopeless(task, settings):
+        return lambda start, count: [None] * count
+
+    with pytest.raises(ValueError, match=r"lamp_on: expected 3 successes .* got 0 in 40 attempts"):
+        generate_demonstrations(tmp_path / "new", ["lamp_on"], 3, demonstrator=hopeless, batch=4, progress=False)
+
+
+def test_missing_depth_becomes_zero():
+    depth = np.array([[1.5, np.inf], [np.nan, 100.0]])
+    np.testing.assert_array_equal(mark_missing(depth), [[1.5, 0], [0, 0]])
+
+
+def test_latch_is_replayed_in_order_and_never_goes_back():
+    keypoints = np.array([[[0, 0, 0], [1, 0, 0]]], np.float32)
+    way = np.array([[0.5, 0, 0], [1, 0, 0], [0.04, 0, 0], [0.5, 0, 0], [1, 0, 0], [0, 0, 0]], np.float32)[:, None]
+    active = replay_latch(jnp.asarray(way), jnp.asarray(keypoints))
+    # Passing the second keypoint before the first does not count.
+    np.testing.assert_array_equal(active[:, 0, 0], [0, 0, 1, 1, 1, 1])
+
+
+def test_recorded_expert_succeeds_again_from_its_seed(tmp_path):
+    options = {"image_size": 24, "batch": 2, "perturb_probability": 1.0}
+    expert = ScriptedExpert("lamp_on", Settings(**options))
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        generate_demonstrations(folder, ["lamp_on"], 2, demonstrator=lambda *_: expert, progress=False, **options)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    reader = EpisodeReader(tmp_path / "a")
+    episode = reader.episode(1)
+
+    environment = expert.environment
+    assert [reader.episode(i).seed for i in range(2)] == [0, 1]
+    state = environment.reset(episode_keys(0, "train", "lamp_on", 0, 2))
+    first = environment.observe(state)
+    for i in range(2):
+        frame = decode_frame(reader.episode(i), 0)
+        np.testing.assert_array_equal(frame["rgb"], first.rgb[i])
+        # The format keeps tenths of a millimetre.
+        np.testing.assert_allclose(frame["depth"], mark_missing(np.asarray(first.depth[i])), atol=1e-4)
+    for m in range(episode.num_frames):
+        both = [reader.episode(i) for i in range(2)]
+        pose = jnp.stack([x.target_pose[m] for x in both])
+        state = environment.execute(state, Action(pose, jnp.stack([x.target_gripper[m] for x in both])))
+    assert np.all(environment.success(state))
+
+    # The arm was led off the expert's way, by no more than asked for, and is still told the expert's next pose.
+    miss = np.abs(episode.pose[1, :, :3] - episode.target_pose[0, :, :3]).max()
+    assert 0.002 < miss < 0.04
+    np.testing.assert_array_equal(episode.active_keypoint, np.broadcast_to(episode.keypoints[:, 0], (2, 1, 3)))

@@ -1,0 +1,236 @@
+"""Scripted-expert demonstrations: python -m data_pipelines.demos OUT --tasks lamp_on put_rubbish_in_bin --episodes 100
+
+Runs the tasks' scripted experts in C MuJoCo, keeps the episodes that the task itself counts as a success, and replaces
+the others by further seeds. Interrupted, it continues with the first missing shard; every shard depends only on the
+options and its own number, so the result is the same.
+"""
+
+import dataclasses
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from data_pipelines.episodes import INDEX_FILE, check_shard, read_index, write_index, write_shard
+from data_pipelines.records import MAX_DEPTH, DataError, Episode, make_episode
+from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.errors import UserError
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.tasks import get_task
+from dsvla_jax.types import Action, Array
+
+# Attempts, as a multiple of the episodes asked for, after which an expert counts as broken.
+MAX_ATTEMPTS = 10
+
+# (first number, count) -> an episode for each number of the seed stream, None for a failure.
+Demonstrate = Callable[[int, int], Sequence[Episode | None]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What decides the contents of a shard, besides its task and number."""
+
+    image_size: int = 96
+    """Rendered pixels a side."""
+    seed: int = 0
+    perturb: float = 0.03
+    """Most metres an axis by which the arms miss a key pose, so that observations off the expert's path are recorded,
+    with the expert's next key pose as the target."""
+    perturb_probability: float = 0.5
+    """How often a key pose is missed on purpose."""
+    batch: int = 20
+    """Episodes simulated at a time, and attempts a shard."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(Settings):
+    """Options of the command line."""
+
+    out: tyro.conf.Positional[Path] = dataclasses.field(kw_only=True)
+    """The folder to write; a folder with the same options is continued."""
+    tasks: tuple[str, ...] = dataclasses.field(kw_only=True)
+    """Names of tasks."""
+    episodes: int = 100
+    """Successful demonstrations a task."""
+
+
+class ScriptedExpert:
+    """Demonstrations of one task by its scripted expert."""
+
+    def __init__(self, task: str, settings: Settings):
+        self.task = get_task(task)
+        self.settings = settings
+        self.environment = Environment(self.task, physics="mujoco", image_size=settings.image_size)
+        self._replay_latch = jax.jit(jax.vmap(replay_latch))
+
+    def __call__(self, start: int, count: int) -> list[Episode | None]:
+        """Episodes start .. start + count - 1 of the training stream; None where the expert did not succeed."""
+        environment, settings = self.environment, self.settings
+        state = environment.reset(episode_keys(settings.seed, "train", self.task.name, start, count))
+        keypoints = np.asarray(environment.keypoints(state))
+        plan = environment.expert(state)
+        poses, grippers = np.asarray(plan.pose), np.asarray(plan.gripper_open)  # (B, M, A, 7), (B, M, A)
+        generators = [
+            np.random.default_rng([settings.seed, zlib.crc32(self.task.name.encode()), start + i]) for i in range(count)
+        ]
+        missed = poses.copy()
+        missed[..., :3] += np.stack([self._misses(rng, poses.shape[1]) for rng in generators])
+
+        observations, before_success = [], []
+        for m in range(poses.shape[1]):
+            observations.append(jax.tree.map(np.asarray, environment.observe(state)))
+            before_success.append(~np.asarray(environment.success(state)))
+            state = environment.execute(
+                state, Action(pose=jnp.asarray(missed[:, m]), gripper_open=jnp.asarray(grippers[:, m]))
+            )
+        positions = np.stack([observation.pose[..., :3] for observation in observations], axis=1)
+        active = np.asarray(self._replay_latch(positions, keypoints))
+        good = np.asarray(environment.success(state)) & ~np.asarray(state.ik_failed) & ~np.asarray(state.diverged)
+
+        episodes: list[Episode | None] = []
+        for i in range(count):
+            # Nobody acts after success, so nothing is recorded after it.
+            frames = int(np.sum([running[i] for running in before_success]))
+            if not good[i] or frames == 0:
+                episodes.append(None)
+                continue
+            seen = [jax.tree.map(lambda x, i=i: x[i], observation) for observation in observations[:frames]]
+            episodes.append(
+                make_episode(
+                    task=self.task.name,
+                    instruction=self.task.instructions[generators[i].integers(len(self.task.instructions))],
+                    seed=start + i,
+                    rgb=[x.rgb for x in seen],
+                    depth=[mark_missing(x.depth) for x in seen],
+                    intrinsics=np.stack([x.camera.intrinsics for x in seen]),
+                    world_from_camera=np.stack([x.camera.world_from_camera for x in seen]),
+                    pose=np.stack([x.pose for x in seen]),
+                    gripper_open=np.stack([x.gripper_open for x in seen]),
+                    target_pose=poses[i, :frames],
+                    target_gripper=grippers[i, :frames],
+                    keypoints=keypoints[i],
+                    active_keypoint=active[i, :frames],
+                )
+            )
+        return episodes
+
+    def _misses(self, rng: np.random.Generator, frames: int) -> np.ndarray:
+        """How far each key pose is missed, float (M, 1, 3) metres.
+
+        The last one is never missed: nothing is observed after it. Two arms miss together, because apart they would
+        drop what they hold between them.
+        """
+        limit = self.settings.perturb
+        offsets = rng.uniform(-limit, limit, (frames, 1, 3))
+        offsets *= rng.random((frames, 1, 1)) < self.settings.perturb_probability
+        offsets[-1] = 0
+        return offsets
+
+
+def mark_missing(depth: np.ndarray) -> np.ndarray:
+    """Depth in metres with 0 wherever nothing was hit or it is too far for the format."""
+    return np.where(np.isfinite(depth) & (depth > 0) & (depth <= MAX_DEPTH), depth, 0)
+
+
+def replay_latch(end_effector: Array, keypoints: Array) -> Array:
+    """The keypoint each arm is heading for in every frame: positions (F, A, 3), keypoints (A, K, 3) -> (F, A, 3)."""
+
+    def look(latched: Array, position: Array) -> tuple[Array, Array]:
+        latched = advance_latch(latched, position, keypoints)
+        return latched, jax.vmap(active_keypoint)(latched, keypoints)
+
+    return jax.lax.scan(look, jnp.zeros(keypoints.shape[0], jnp.int32), end_effector)[1]
+
+
+def generate_demonstrations(
+    folder: Path,
+    tasks: Sequence[str],
+    episodes: int = 100,
+    *,
+    demonstrator: Callable[[str, Settings], Demonstrate] = ScriptedExpert,
+    progress: bool = True,
+    **settings: Any,
+) -> None:
+    """Makes sure that the folder holds at least `episodes` successful demonstrations of every task.
+
+    For one process a folder. What is there already with the same settings (fields of `Settings`) is kept; other
+    settings raise DataError.
+    demonstrator: (task name, settings) -> the function that attempts episodes; made only when something is missing.
+    """
+    wanted = Settings(**settings)
+    folder = Path(folder)
+    entries = {entry["file"]: entry for entry in existing_shards(folder, wanted)}
+    made, attempts = 0, 0
+    with tqdm(total=episodes * len(tasks), desc="demonstrations", unit="episode", disable=not progress) as bar:
+        for task in tasks:
+            kept, number, demonstrate = 0, 0, None
+            while kept < episodes:
+                name = f"{task}-{number:05d}.array_record"
+                entry = entries.get(name)
+                if entry is None or (entry["cut"] and kept + len(entry["frames"]) < episodes) or damaged(folder, entry):
+                    if demonstrate is None:
+                        bar.set_postfix_str(f"{task}: the first batch compiles")
+                        demonstrate = demonstrator(task, wanted)
+                    good = [x for x in demonstrate(number * wanted.batch, wanted.batch) if x is not None]
+                    chosen = good[: episodes - kept]
+                    entry = write_shard(folder, name, task, chosen, cut=len(chosen) < len(good))
+                    entries[name] = entry
+                    write_index(folder, [entries[key] for key in sorted(entries)], dataclasses.asdict(wanted))
+                    made, attempts = made + len(good), attempts + wanted.batch
+                    bar.set_postfix_str(task)
+                bar.update(min(len(entry["frames"]), episodes - kept))
+                kept += len(entry["frames"])
+                number += 1
+                if kept < episodes and number * wanted.batch >= MAX_ATTEMPTS * max(episodes, wanted.batch):
+                    raise UserError(
+                        f"{task}: expected {episodes} successes of the scripted expert, got {kept} in"
+                        f" {number * wanted.batch} attempts; lower `perturb`, or correct the task's expert"
+                    )
+    if attempts:
+        size = sum(entry["bytes"] for entry in entries.values()) / 1e6
+        rate = f"the experts succeeded in {made} of {attempts} attempts"
+        tqdm.write(f"{folder}: {episodes} demonstrations each of {', '.join(tasks)}; {rate}; {size:.0f} MB in all")
+
+
+def existing_shards(folder: Path, wanted: Settings) -> list[dict[str, Any]]:
+    """The index entries of a folder made with the same settings; none where there is no index yet."""
+    if not (folder / INDEX_FILE).exists():
+        return []
+    index = read_index(folder)
+    for field, value in dataclasses.asdict(wanted).items():
+        if (found := index["settings"].get(field)) != value:
+            fix = "choose another folder, the same setting, or delete this folder"
+            raise DataError(folder / INDEX_FILE, f"settings.{field}", f"{value!r} as asked for", repr(found), fix)
+    return index["shards"]
+
+
+def damaged(folder: Path, entry: dict[str, Any]) -> bool:
+    """Whether a shard is missing or not what the index says."""
+    try:
+        check_shard(folder, entry, digest=True)
+    except DataError:
+        return True
+    return False
+
+
+def main(options: Options) -> None:
+    """Generates what the options ask for."""
+    for task in options.tasks:
+        get_task(task)  # a misspelt name is told before the work for the others
+    settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(Settings)}
+    generate_demonstrations(options.out, options.tasks, options.episodes, **settings)
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        parsed = tyro.cli(Options, prog="python -m data_pipelines.demos", description=__doc__)
+        configure_jax()
+        main(parsed)
