@@ -33,6 +33,9 @@ test: setup  ## the test suite
 test-slow: setup  ## the long tests too
 	$(PY) -m pytest -m "slow or not slow"
 
+bench: setup  ## list the checks that take minutes
+	$(PY) -m benchmarks
+
 lint: setup  ## ruff and pyright
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .

@@ -17,9 +17,9 @@ def config() -> Experiment:
         encoding=EncodingConfig(
             image_size=96,
             patch_size=16,
-            points=PointTokenizerConfig(num_points=256, group_sizes=(144, 72, 36), neighbours=8, width=WIDTH // 8),
+            points=PointTokenizerConfig(num_points=256, group_sizes=(144, 72, 36), neighbours=8, width=WIDTH),
             style="compact",
-            max_text=48,
+            max_text_length=48,
         ),
         model=ModelConfig(
             vision=VisionConfig(image_size=96, patch_size=16, width=WIDTH, layers=3, heads=4),

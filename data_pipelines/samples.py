@@ -56,7 +56,7 @@ def make_sampler(
         )
         bins = np.asarray(codec.encode(frame["target_pose"], frame["target_gripper"]))
         answer = format_answer(bins, encoding.style)
-        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text)
+        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
         soft_mask = np.zeros_like(answer_mask)
         soft_mask[answer_mask] = soft_slots[len(bins)]
         return {

@@ -74,7 +74,7 @@ class Policy:
             build_prompt(encoding, text, poses[i], grippers[i], None if keypoints is None else keypoints[i])
             for i, text in enumerate(instructions)
         ]
-        encoded = [encode_text(self.tokenizer, prompt, None, encoding.max_text)[:2] for prompt in prompts]
+        encoded = [encode_text(self.tokenizer, prompt, None, encoding.max_text_length)[:2] for prompt in prompts]
         tokens, masks = (np.stack(column) for column in zip(*encoded, strict=True))
         answers = _decode(self.config, self.tokenizer, self.variables, observation, tokens, masks)
         texts = [self.tokenizer.decode([int(token) for token in row]) for row in np.asarray(answers)]

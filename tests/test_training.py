@@ -26,9 +26,9 @@ def small_experiment(**changes) -> Experiment:
         encoding=EncodingConfig(
             image_size=32,
             patch_size=16,
-            points=PointTokenizerConfig(num_points=32, group_sizes=(16, 8, 4), neighbours=4, width=4),
+            points=PointTokenizerConfig(num_points=32, group_sizes=(16, 4), neighbours=4, width=32),
             style="compact",
-            max_text=16,
+            max_text_length=16,
         ),
         model=ModelConfig(
             vision=VisionConfig(image_size=32, patch_size=16, width=32, layers=1, heads=2),
@@ -43,7 +43,7 @@ def small_experiment(**changes) -> Experiment:
 
 def random_batch(experiment: Experiment) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
-    size, image, text = experiment.batch_size, 32, experiment.encoding.max_text
+    size, image, text = experiment.batch_size, 32, experiment.encoding.max_text_length
     camera = np.eye(4, dtype=np.float32)
     intrinsics = np.array([[-40, 0, 16], [0, -40, 16], [0, 0, 1]], np.float32)
     answer = np.zeros((size, text), bool)

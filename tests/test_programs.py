@@ -1,0 +1,51 @@
+"""The two programs as a person runs them: mistakes end in one clear message, a non-zero status and no traceback."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", "JAX_PLATFORMS": "cpu"}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["train.py", "tinny"], "unknown config 'tinny': did you mean 'tiny'?"),
+        (["train.py", "tiny", "--optimizer.learning-rat", "1"], "learning-rate"),
+        (["train.py", "tiny", "--steps", "many"], "many"),
+        (["train.py", "tiny", "--data.tasks", "lamp_of"], "lamp_on"),
+        (["eval.py", "nowhere"], "no run here"),
+        (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
+    ],
+)
+def test_a_mistake_ends_in_one_message(arguments: list[str], expected: str, tmp_path: Path):
+    if arguments[0].endswith(".py"):
+        arguments = [str(ROOT / arguments[0]), *arguments[1:]]
+    result = run(*arguments, folder=tmp_path)
+    text = result.stdout + result.stderr
+    assert result.returncode not in (0, None)
+    assert "Traceback" not in text
+    assert expected in text
+    assert not any(tmp_path.rglob("*.json")), "nothing is written for a mistake"
+
+
+def test_an_existing_run_is_not_overwritten(tmp_path: Path):
+    folder = tmp_path / "runs" / "tiny"
+    folder.mkdir(parents=True)
+    config = folder / "config.json"
+    config.write_text("{}")
+    result = run(str(ROOT / "train.py"), "tiny", folder=tmp_path)
+    assert result.returncode == 1
+    assert "already holds a run" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert config.read_text() == "{}"
