@@ -1,0 +1,315 @@
+"""The robot, its kinematics, the controller, both steppers and the episode, against MuJoCo and against physics."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from dsvla_jax.geometry.rotations import DOWN, quaternion_from_axis_angle, quaternion_multiply, rotation_distance
+from dsvla_jax.sim import controller, physics, robot
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.kinematics import forward_kinematics, inverse_kinematics
+from dsvla_jax.sim.tasks import Graspable, Placement, Task
+from dsvla_jax.sim.tasks.task import BOX, add_object, add_part, upright_pose
+from dsvla_jax.types import TABLE_HEIGHT, Action
+
+HALF = 0.0225
+BASE = np.array([*robot.SINGLE_BASE, 0, 0, 0, 1], np.float32)
+
+
+def _cube_task(num_arms: int) -> Task:
+    """A cube on the table; success is holding it 10 cm up."""
+
+    def build(spec):
+        cube = add_object(spec, "cube", HALF)
+        add_part(cube, "cube", BOX, [HALF] * 3, [0, 0, 0], [0.8, 0.1, 0.1, 1], robot.OBJECT, mass=0.1)
+
+    def sample(key):
+        xy = jax.random.uniform(key, (2,), minval=jnp.array([0.05, -0.15]), maxval=jnp.array([0.25, 0.15]))
+        # A little above the table, so that it has to settle.
+        return Placement(free={"cube": upright_pose(xy[0], xy[1], TABLE_HEIGHT + HALF + 0.005)})
+
+    def expert(view):
+        raise NotImplementedError
+
+    return Task(
+        name="cube",
+        num_arms=num_arms,
+        build=build,
+        sample=sample,
+        instructions=("lift the cube",),
+        keypoints=lambda view: jnp.broadcast_to(view.body_pose("cube")[:3], (num_arms, 1, 3)),
+        success=lambda view: view.body_pose("cube")[2] > TABLE_HEIGHT + HALF + 0.1,
+        expert=expert,
+        graspables=(Graspable("cube", (HALF, HALF, HALF)),),
+    )
+
+
+@functools.cache
+def _environment(num_arms: int = 1, backend: str = "mujoco") -> Environment:
+    return Environment(_cube_task(num_arms), backend, image_size=32)
+
+
+def _cube(env: Environment, state) -> np.ndarray:
+    return np.asarray(jax.vmap(lambda s: env.view(s).body_pose("cube"))(state))
+
+
+def _at(positions: np.ndarray, gripper: float, turn=DOWN) -> Action:
+    """positions (B, A, 3), one gripper command for all."""
+    positions = jnp.asarray(positions, jnp.float32)
+    pose = jnp.concatenate([positions, jnp.broadcast_to(turn, (*positions.shape[:2], 4))], axis=-1)
+    return Action(pose=pose, gripper_open=jnp.full(positions.shape[:2], gripper, jnp.float32))
+
+
+def _up(height: float) -> np.ndarray:
+    return np.array([0.0, 0.0, height])
+
+
+def _keys(count: int):
+    return jax.random.split(jax.random.key(0), count)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0, 1.0), (0.0, 0.0, np.sin(0.4), np.cos(0.4))])
+def test_forward_kinematics_is_mujocos(turn):
+    spec = mujoco.MjSpec()
+    robot.set_physics_options(spec)
+    robot.add_panda(spec, "left_", (0.1, -0.2, 0.3), turn)
+    model = spec.compile()
+    data, arm = mujoco.MjData(model), robot.find_arm(model, "left_")
+    forward = jax.jit(forward_kinematics)
+    for joints in np.random.default_rng(0).uniform(robot.JOINT_LOW, robot.JOINT_HIGH, (20, 7)):
+        data.qpos[arm.joints] = joints
+        mujoco.mj_kinematics(model, data)
+        pose = np.asarray(forward(jnp.asarray(joints, jnp.float32), jnp.asarray(arm.base)))
+        np.testing.assert_allclose(pose[:3], data.site("left_tcp").xpos, atol=2e-6)
+        wxyz = np.zeros(4)
+        mujoco.mju_mat2Quat(wxyz, data.site("left_tcp").xmat)
+        assert rotation_distance(pose[3:], np.roll(wxyz, -1).astype(np.float32)) < 5e-6
+        assert pose[6] >= 0
+
+
+def test_a_spec_in_degrees_is_refused():
+    with pytest.raises(ValueError, match="set_physics_options"):
+        robot.add_panda(mujoco.MjSpec(), "left_", robot.SINGLE_BASE)
+
+
+def test_start_posture_is_rlbenchs():
+    pose = np.asarray(forward_kinematics(jnp.asarray(robot.START_JOINTS, jnp.float32), jnp.asarray(BASE)))
+    np.testing.assert_allclose(pose[:3], [0.2785, -0.0082, 1.4719], atol=0.05)
+    assert rotation_distance(pose[3:], DOWN) < np.deg2rad(15)
+
+
+def test_inverse_kinematics_reaches_the_workspace():
+    rng = np.random.default_rng(1)
+    low, high = [0.0, -0.3, TABLE_HEIGHT + 0.02], [0.35, 0.3, TABLE_HEIGHT + 0.25]
+    positions = rng.uniform(low, high, (64, 3)).astype(np.float32)
+    yaw = quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(rng.uniform(-1.5, 1.5, 64), jnp.float32))
+    poses = jnp.concatenate([positions, quaternion_multiply(yaw, jnp.asarray(DOWN))], axis=-1)
+    seed = jnp.asarray(robot.START_JOINTS, jnp.float32)
+    joints, ok = jax.jit(jax.vmap(lambda pose: inverse_kinematics(pose, seed, BASE)))(poses)
+    assert np.mean(ok) > 0.95
+    reached = jax.vmap(lambda j: forward_kinematics(j, BASE))(joints)
+    assert rotation_distance(reached[:, 3:], poses[:, 3:])[np.asarray(ok)].max() < 0.02
+    assert np.linalg.norm((reached - poses)[:, :3], axis=-1)[np.asarray(ok)].max() < 0.002
+    assert (joints >= robot.JOINT_LOW).all()
+    assert (joints <= robot.JOINT_HIGH).all()
+
+    far = poses.at[:, 0].add(2.0)
+    assert not np.any(jax.vmap(lambda pose: inverse_kinematics(pose, seed, BASE)[1])(far))
+
+
+def test_the_path_is_straight_and_ends_at_rest():
+    seed = jnp.asarray(robot.START_JOINTS, jnp.float32)
+    goal = jnp.asarray([0.15, 0.2, 0.85, *DOWN], jnp.float32)
+    knots, ok = jax.jit(controller.plan_joints)(seed, goal, BASE)
+    assert ok
+    places = np.asarray(jax.vmap(lambda j: forward_kinematics(j, BASE))(knots))[:, :3]
+    along = np.linspace(places[0], np.asarray(goal[:3]), len(places))
+    assert np.abs(places - along).max() < 0.002
+    targets = np.asarray(controller.joint_targets(knots))
+    np.testing.assert_allclose(targets[-1], knots[-1], atol=1e-5)
+    assert np.abs(targets[0] - np.asarray(seed)).max() < 0.02
+
+
+@pytest.mark.parametrize("num_arms", [1, 2])
+def test_key_poses_are_tracked(num_arms):
+    env = _environment(num_arms)
+    state = env.reset(_keys(8))
+    sides = np.array([0.0] if num_arms == 1 else [0.3, -0.3])
+    rng = np.random.default_rng(2)
+    for gripper in (0.0, 1.0, 0.0):
+        positions = rng.uniform([0.0, -0.12, TABLE_HEIGHT + 0.12], [0.3, 0.12, TABLE_HEIGHT + 0.4], (8, num_arms, 3))
+        positions[..., 1] += sides
+        action = _at(positions, gripper)
+        state = env.execute(state, action)
+        pose, gripper_open = env.end_effector(state)
+        assert not np.any(state.ik_failed)
+        assert np.linalg.norm((pose - action.pose)[..., :3], axis=-1).max() < 0.005
+        assert rotation_distance(pose[..., 3:], action.pose[..., 3:]).max() < 0.02
+        np.testing.assert_array_equal(gripper_open, action.gripper_open)
+
+
+def test_reset_is_seeded_settled_and_observable():
+    env = _environment()
+    state = env.reset(_keys(3))
+    np.testing.assert_allclose(_cube(env, state)[:, 2], TABLE_HEIGHT + HALF, atol=1e-3)
+    assert np.abs(np.asarray(state.qvel)).max() < 1e-2
+    again = env.reset(_keys(3)[1:])
+    np.testing.assert_allclose(again.qpos, np.asarray(state.qpos)[1:], atol=1e-6)
+    assert np.ptp(_cube(env, state)[:, 0]) > 0.01
+    assert not np.any(state.succeeded)
+    assert not np.any(state.ik_failed)
+    observation = env.observe(state)
+    assert observation.rgb.shape == (3, 32, 32, 3)
+    assert observation.depth.shape == (3, 32, 32)
+    assert observation.camera.intrinsics.shape == (3, 3, 3)
+    assert observation.pose.shape == (3, 1, 7)
+    np.testing.assert_array_equal(observation.gripper_open, 1.0)
+    assert env.keypoints(state).shape == (3, 1, 1, 3)
+    cube_geom = env.scene.mj_model.geom("cube").id
+    assert (np.asarray(env.render(state)[2]) == cube_geom).any()
+
+
+def _carry(env: Environment, state, batch: int):
+    """Grasps, lifts and carries the cube. Returns the state when held, and when carried."""
+    cube = _cube(env, state)[:, None, :3]
+    held = env.execute(env.execute(state, _at(cube + _up(0.1), 1.0)), _at(cube, 0.0))
+    lifted = env.execute(held, _at(cube + _up(0.2), 0.0))
+    goal = np.broadcast_to([0.15, 0.0, TABLE_HEIGHT + 0.2], (batch, 1, 3))
+    turn = quaternion_multiply(quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(0.7)), jnp.array(DOWN))
+    return held, env.execute(lifted, _at(goal, 0.0, turn)), goal
+
+
+def test_a_cube_is_attached_carried_and_released():
+    env = _environment()
+    state = env.reset(_keys(4))
+    weld = env.scene.graspables[0].welds[0]
+    held, carried, goal = _carry(env, state, 4)
+    assert np.asarray(held.eq_active)[:, weld].all()
+    assert not np.any(held.succeeded)
+    np.testing.assert_allclose(_cube(env, carried)[:, :3], goal[:, 0], atol=0.006)
+    np.testing.assert_array_equal(env.success(carried), True)
+
+    dropped = env.execute(carried, _at(goal, 1.0))
+    assert not np.asarray(dropped.eq_active)[:, weld].any()
+    settled = env.execute(dropped, _at(goal, 1.0))
+    assert _cube(env, settled)[:, 2].max() < TABLE_HEIGHT + 0.05
+    np.testing.assert_array_equal(env.success(settled), True)  # latched
+
+
+def test_only_a_cube_at_the_closing_fingers_is_attached():
+    env = _environment()
+    state = env.reset(_keys(2))
+    weld = env.scene.graspables[0].welds[0]
+    cube = _cube(env, state)[:, None, :3]
+    above = env.execute(state, _at(cube + _up(HALF + 0.05), 0.0))
+    assert not np.asarray(above.eq_active)[:, weld].any()
+    # The fingers are closed already: touching the cube does not attach it.
+    touched = env.execute(above, _at(cube + _up(HALF + 0.01), 0.0))
+    assert not np.asarray(touched.eq_active)[:, weld].any()
+
+
+def test_an_unreachable_pose_stops_its_own_episode_only():
+    env = _environment()
+    state = env.reset(_keys(3))
+    near = _at(np.full((3, 1, 3), [0.2, 0.1, 1.0]), 0.0)
+    for bad in (5.0, np.nan):
+        mixed = near.replace(pose=near.pose.at[1, 0, 0].set(bad))
+        after = env.execute(state, mixed)
+        np.testing.assert_array_equal(after.ik_failed, [False, True, False])
+        np.testing.assert_allclose(np.asarray(after.qpos)[1], np.asarray(state.qpos)[1], atol=1e-3)
+        alone = env.execute(state, near)
+        np.testing.assert_array_equal(np.asarray(after.qpos)[[0, 2]], np.asarray(alone.qpos)[[0, 2]])
+
+
+def test_actions_of_a_wrong_shape_are_named():
+    env = _environment()
+    with pytest.raises(ValueError, match=r"expected pose \(2, 1, 7\)"):
+        env.execute(env.reset(_keys(2)), _at(np.zeros((2, 2, 3)), 1.0))
+    with pytest.raises(ValueError, match="1 arm"):
+        Environment(env.task, num_arms=2)
+
+
+@functools.cache
+def _tiny_model() -> mujoco.MjModel:
+    """A ball on a plane, a ball welded to a mocap body, a slide with an actuator."""
+    spec = mujoco.MjSpec()
+    robot.set_physics_options(spec)
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    ball = mujoco.mjtGeom.mjGEOM_SPHERE
+    spec.worldbody.add_geom(type=plane, size=[1, 1, 0.1], contype=1, conaffinity=6)
+    for name, x in (("free", 0.0), ("held", 0.5)):
+        body = spec.worldbody.add_body(name=name, pos=[x, 0, 0.06])
+        body.add_freejoint()
+        body.add_geom(type=ball, size=[0.05, 0, 0], mass=0.1, contype=2, conaffinity=1)
+    spec.worldbody.add_body(name="hand", mocap=True, pos=[0.5, 0, 0.3])
+    slider = spec.worldbody.add_body(pos=[0, 0.5, 0.3])
+    slider.add_joint(name="slide", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0], damping=0.5)
+    slider.add_geom(type=ball, size=[0.05, 0, 0], mass=1.0, contype=0, conaffinity=0)
+    spec.add_equality(
+        name="weld",
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="hand",
+        name2="held",
+        active=False,
+        solref=[0.02, 1.0],
+    )
+    actuator = spec.add_actuator(name="slide", target="slide", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.set_to_position(kp=50.0, kv=5.0)
+    return spec.compile()
+
+
+def _tiny_run(stepper: physics.Stepper) -> physics.SimState:
+    """Four episodes: the second begins with a non-finite velocity, and each welds its ball at an offset of its own
+    half-way through."""
+    state = physics.initial_state(_tiny_model(), 4)
+    rows = np.zeros((4, 1, mujoco.mjNEQDATA), np.float32)
+    rows[:, 0, 3:11] = [0.1, 0, -0.1, 1, 0, 0, 0, 1]
+    rows[:, 0, 3] += 0.02 * np.arange(4)
+    mocap = np.array(state.mocap_pos)
+    mocap[:, 0, 1] = 0.1 * np.arange(4)
+    qvel = np.array(state.qvel)
+    qvel[:, 0] = 0.3
+    qvel[1, 0] = np.nan
+    state = state.replace(eq_data=rows, mocap_pos=mocap, qvel=qvel)
+    steps = 120
+    controls = np.broadcast_to(np.linspace(0, 1, steps, dtype=np.float32)[None, :, None], (4, steps, 1))
+    active = np.broadcast_to((np.arange(steps) >= 60)[None, :, None], (4, steps, 1))
+    # Holds only while the ball falls, at no end of the run.
+    return stepper(state, jnp.asarray(controls), lambda s: (s.qpos[2] < 0.0575) & (s.qpos[0] < 0.05), active)
+
+
+def test_both_steppers_agree_and_keep_episodes_apart():
+    c_state = _tiny_run(physics.mujoco_stepper(_tiny_model()))
+    mjx_stepper = physics.mjx_stepper(_tiny_model())
+    mjx_state = _tiny_run(jax.jit(mjx_stepper, static_argnums=2))
+    good = np.array([0, 2, 3])
+    for state in (c_state, mjx_state):
+        np.testing.assert_array_equal(state.diverged, [False, True, False, False])
+        np.testing.assert_array_equal(state.succeeded, [True, False, True, True])
+        np.testing.assert_allclose(np.asarray(state.qpos)[1], np.asarray(_tiny_model().qpos0), atol=1e-6)
+        # The welded balls have come to their own offsets from their own hands.
+        held = np.asarray(state.qpos)[good, 7:10]
+        expected = [[0.6 + 0.02 * i, 0.1 * i, 0.2] for i in good]
+        np.testing.assert_allclose(held, expected, atol=0.02)
+        assert np.isfinite(np.asarray(state.geom_xpos)).all()
+    for field in ("qpos", "qvel", "ctrl", "geom_xpos", "geom_xmat"):
+        first, second = (np.asarray(getattr(s, field))[good] for s in (c_state, mjx_state))
+        np.testing.assert_allclose(first, second, atol=2e-3, err_msg=field)
+    np.testing.assert_array_equal(c_state.eq_active, mjx_state.eq_active)
+
+
+@pytest.mark.slow
+def test_mjx_grasps_and_carries_as_mujoco_does():
+    env, oracle = _environment(backend="mjx"), _environment()
+    state = env.reset(_keys(2))
+    expected = oracle.reset(_keys(2))
+    np.testing.assert_allclose(state.qpos, expected.qpos, atol=1e-3)
+    _, carried, goal = _carry(env, state, 2)
+    np.testing.assert_array_equal(env.success(carried), True)
+    np.testing.assert_allclose(_cube(env, carried)[:, :3], goal[:, 0], atol=0.006)
+    np.testing.assert_allclose(_cube(env, carried), _cube(oracle, _carry(oracle, expected, 2)[1]), atol=0.02)
