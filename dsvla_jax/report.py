@@ -144,10 +144,10 @@ def mark_targets(frame: np.ndarray, positions, camera: Camera) -> np.ndarray:
         size = radius if inside else 0.5 * radius
         place = np.clip([u, v], size, [width - 1 - size, height - 1 - size]) if not inside else np.array([u, v])
         centre = tuple(round(float(c) * 2**fraction) for c in place)
-        for shade, thickness in (((0, 0, 0), 3), (colour, 1)) if inside else (((0, 0, 0), 2), (colour, -1)):
+        for shade, thickness in (((0, 0, 0), 2), (colour, 1)) if inside else (((0, 0, 0), 2), (colour, -1)):
             cv2.circle(picture, centre, int(size * 2**fraction), shade, thickness, cv2.LINE_AA, fraction)
         if inside:
-            cv2.circle(picture, centre, int(0.25 * radius * 2**fraction), colour, -1, cv2.LINE_AA, fraction)
+            cv2.circle(picture, centre, int(0.15 * radius * 2**fraction), colour, -1, cv2.LINE_AA, fraction)
     return picture
 
 
