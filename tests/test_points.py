@@ -47,6 +47,12 @@ def test_farthest_points_equal_brute_force(exact):
     assert farthest_point_sample(points, None, 40)[1].tolist() == brute_force_fps(points[1], everything, 40)
 
 
+def test_farthest_points_of_a_large_batch_equal_those_of_its_members():
+    points, valid = grid_points((11, 30)), np.asarray(np.random.default_rng(1).random((11, 30)) < 0.8)
+    expected = [brute_force_fps(p, v, 12) for p, v in zip(points, valid, strict=True)]
+    np.testing.assert_array_equal(farthest_point_sample(points, valid, 12), expected)
+
+
 def test_farthest_points_repeat_the_first_when_valid_ones_run_out():
     points = np.arange(18, dtype=np.float32).reshape(1, 6, 3)
     valid = np.array([[False, True, False, True, True, False]])

@@ -74,11 +74,15 @@ def positional_encoding(coordinates: ArrayLike, channels: int, alpha: float, bet
     in Point-NN; the channels that 6 does not divide are zero, at the end.
     """
     frequencies = channels // 6
-    scale = np.repeat(beta / alpha ** (np.arange(frequencies) / max(frequencies, 1)), 2).astype(np.float32)
-    angles = jnp.asarray(coordinates)[..., None] * scale
-    waves = _sine(angles, quarter_turn=np.tile([False, True], frequencies))
-    waves = waves.reshape(*waves.shape[:-2], 6 * frequencies)
-    return jnp.pad(waves, [(0, 0)] * (waves.ndim - 1) + [(0, channels - 6 * frequencies)])
+    scale = np.repeat(beta / alpha ** (np.arange(frequencies) / max(frequencies, 1)), 2)
+    by_axis = np.zeros((3, channels), np.float32)
+    for axis in range(3):
+        by_axis[axis, axis * 2 * frequencies : (axis + 1) * 2 * frequencies] = scale
+    cosine = np.arange(channels) % 2 == 1
+    cosine[6 * frequencies :] = False
+    x, y, z = jnp.split(jnp.asarray(coordinates, jnp.float32), 3, axis=-1)
+    # Each channel has one term that is not zero; as a sum over axes it stays one vectorised loop.
+    return _sine(x * by_axis[0] + y * by_axis[1] + z * by_axis[2], quarter_turn=cosine)
 
 
 def _sine(angles: Array, quarter_turn: np.ndarray) -> Array:
@@ -135,8 +139,17 @@ def _group(scaled: Array, features: Array, count: int, config: PointTokenizerCon
     # Point-NN divides by the deviation over the whole batch. Over one cloud, batch-mates cannot change its tokens.
     relative = relative / (jnp.std(relative, ddof=1) + 1e-5)
     channels = features.shape[-1]
-    encoding = positional_encoding(relative, 2 * channels, config.alpha, config.beta)
-    # The centre's features are the same for all its neighbours, so they can be added after pooling.
-    near = jnp.max(features[neighbours] + encoding[..., :channels], axis=1)
-    own = center_features + jnp.max(encoding[..., channels:], axis=1)
-    return jnp.concatenate([near, own], axis=-1)
+
+    # Neighbour by neighbour with a running maximum, unrolled: the (count, K, 2C) tensor, by far the largest of the
+    # input path, never exists, and on a CPU the loop fuses and vectorises, several times faster than max over an axis.
+    # The centre's features are the same for all neighbours and are added after pooling.
+    def encode(neighbour: int) -> Array:
+        return positional_encoding(relative[:, neighbour], 2 * channels, config.alpha, config.beta)
+
+    near, own = jnp.split(encode(0), 2, axis=-1)
+    near = near + features[neighbours[:, 0]]
+    for neighbour in range(1, config.neighbours):
+        next_near, next_own = jnp.split(encode(neighbour), 2, axis=-1)
+        near = jnp.maximum(near, next_near + features[neighbours[:, neighbour]])
+        own = jnp.maximum(own, next_own)
+    return jnp.concatenate([near, center_features + own], axis=-1)
