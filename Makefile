@@ -25,7 +25,7 @@ setup: $(VENV)/.synced  ## make the virtual environment
 train: setup  ## demonstrations, training, closed-loop evaluation and report for CONFIG (default: tiny)
 	$(PY) train.py $(CONFIG) --run $(RUN) --resume
 	$(PY) eval.py $(RUN) --skip-finished
-	@echo "report: $(RUN)/eval/report.html"
+	@echo "report: $(RUN)/eval/mujoco.html"
 
 test: setup  ## the test suite
 	$(PY) -m pytest

@@ -7,8 +7,10 @@ in RUN/eval, one line of JSON an episode and an HTML report with a film strip of
 import dataclasses
 import sys
 import time
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -19,7 +21,7 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.policy import Policy, load_policy
-from dsvla_jax.report import EpisodeResult, print_table, read_results, write_report, write_results
+from dsvla_jax.report import EpisodeResult, mark_targets, print_table, read_results, write_report, write_results
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task
@@ -55,10 +57,10 @@ def main(options: Options) -> None:
         get_task(name)
     episodes = options.episodes or experiment.evaluation.episodes
     folder = options.run / "eval"
-    file = folder / f"{options.physics}.jsonl"
-    stale = not file.exists() or file.stat().st_mtime < (options.run / "metrics.jsonl").stat().st_mtime
-    if options.skip_finished and not stale:
-        print(f"{file} is newer than the last training; nothing to do")
+    noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
+    file = folder / f"{options.physics}{noise}.jsonl"
+    if options.skip_finished and is_finished(file, options.run, tasks, episodes):
+        print(f"{file} is newer than the training and complete: nothing to do")
         print_table(read_results(file))
         return
 
@@ -69,12 +71,20 @@ def main(options: Options) -> None:
         outcome, films = evaluate_task(policy, experiment, name, episodes, options)
         results += outcome
         strips |= {(name, result.seed): film for result, film in zip(outcome, films, strict=True)}
-    folder.mkdir(exist_ok=True)
     write_results(file, results)
-    other = folder / f"{'mjx' if options.physics == 'mujoco' else 'mujoco'}.jsonl"
-    write_report(folder / f"{options.physics}.html", results, strips, read_results(other) if other.exists() else None)
+    other = folder / f"{'mjx' if options.physics == 'mujoco' else 'mujoco'}{noise}.jsonl"
+    report = file.with_suffix(".html")
+    write_report(report, results, strips, read_results(other) if other.exists() else None, title=str(options.run))
     print_table(results)
-    print(f"report: {folder / f'{options.physics}.html'}")
+    print(f"report: {report}")
+
+
+def is_finished(file: Path, run: Path, tasks: Sequence[str], episodes: int) -> bool:
+    """Whether the file holds all these episodes, evaluated after the last training."""
+    if not file.exists() or file.stat().st_mtime < (run / "metrics.jsonl").stat().st_mtime:
+        return False
+    done = Counter(result.task for result in read_results(file))
+    return all(done[task] >= episodes for task in tasks)
 
 
 def evaluate_task(
@@ -101,11 +111,11 @@ def evaluate_task(
         for _ in range(limit):
             observation = environment.observe(state)
             latched = np.asarray(jax.vmap(advance_latch)(latched, observation.pose[..., :3], keypoints))
-            active = np.asarray(jax.vmap(jax.vmap(active_keypoint))(latched, keypoints)) if policy.config.encoding.use_keypoints else None
+            active = np.asarray(jax.vmap(jax.vmap(active_keypoint))(latched, keypoints))
             action, answers = policy.act(observation, instructions, active)
-            rgb = np.asarray(observation.rgb)
+            rgb, targets = np.asarray(observation.rgb), np.asarray(action.pose)[..., :3]
             for i in np.flatnonzero(~success):
-                frames[i].append(rgb[i])
+                frames[i].append(mark_targets(rgb[i], targets[i], environment.camera))
                 actions[i].append(answers[i])
             used += ~success
             state = environment.execute(state, action)
@@ -116,14 +126,22 @@ def evaluate_task(
             if success.all():
                 break
         last = np.asarray(environment.observe(state).rgb)
+        diverged = np.asarray(state.diverged)
     results = []
     for i in range(episodes):
         frames[i].append(last[i])
-        reason = "" if success[i] else "a pose was out of reach" if unreachable[i] else "out of keyframes"
+        reason = "" if success[i] else failure_reason(bool(diverged[i]), bool(unreachable[i]))
         results.append(
             EpisodeResult(name, i, options.physics, bool(success[i]), reason, int(used[i]), instructions[i], actions[i])
         )
     return results, frames
+
+
+def failure_reason(diverged: bool, unreachable: bool) -> str:
+    """Why an episode without success failed, the gravest reason first."""
+    if diverged:
+        return "the simulation diverged"
+    return "a pose was out of reach" if unreachable else "out of keyframes"
 
 
 if __name__ == "__main__":

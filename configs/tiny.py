@@ -1,6 +1,6 @@
-"""The whole paper at a size that a laptop's processor trains in minutes, from scratch.
+"""The whole paper at a size that a laptop processor trains in minutes, from scratch.
 
-What differs from the paper's profile, and why, is in docs/architecture.md under "The tiny configuration".
+What differs from the paper profile, and why, is in docs/architecture.md under "The tiny configuration".
 """
 
 from data_pipelines.samples import suite_tokenizer
@@ -16,24 +16,27 @@ def config() -> Experiment:
     return Experiment(
         encoding=EncodingConfig(
             image_size=96,
-            patch_size=16,
-            points=PointTokenizerConfig(num_points=256, group_sizes=(144, 72, 36), neighbours=8, width=WIDTH),
+            patch_size=24,
+            points=PointTokenizerConfig(num_points=256, group_sizes=(128, 64, 16), neighbours=8, width=WIDTH),
             style="compact",
-            max_text_length=48,
+            max_text_length=56,
         ),
         model=ModelConfig(
-            vision=VisionConfig(image_size=96, patch_size=16, width=WIDTH, layers=3, heads=4),
-            language=LanguageConfig(vocab_size=suite_tokenizer().vocab_size, width=WIDTH, layers=3, heads=4, kv_heads=4, ffn=352),
+            vision=VisionConfig(image_size=96, patch_size=24, width=WIDTH, layers=3, heads=4),
+            language=LanguageConfig(
+                vocab_size=suite_tokenizer().vocab_size, width=WIDTH, layers=3, heads=4, kv_heads=4, ffn=352
+            ),
+            scan_unroll=3,
         ),
         data=DataConfig(
-            episodes=150,
+            episodes=100,
             shift_world=0.2,
             state_jitter=0.02,
             keypoint_noise=0.01,
             keypoint_noise_probability=0.2,
         ),
         optimizer=OptimizerConfig(learning_rate=2e-3),
-        steps=1200,
+        steps=800,
         batch_size=32,
         soft_target_sigma=1.5,
     )

@@ -16,7 +16,7 @@ import numpy as np
 from data_pipelines.augment import jitter_state, perturb_keypoint, random_offset, shift_world, vary_colour
 from data_pipelines.episodes import Frame
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
-from dsvla_jax.encoding.prompts import format_answer
+from dsvla_jax.encoding.prompts import Style, format_answer
 from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar, vocabulary
 from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.training.experiment import DataConfig
@@ -73,7 +73,7 @@ def make_sampler(
     return sample
 
 
-def _soft_slots(tokenizer: WordTokenizer, arms: int, style: str) -> np.ndarray:
+def _soft_slots(tokenizer: WordTokenizer, arms: int, style: Style) -> np.ndarray:
     """bool (L,): which answer tokens name a bin, of which the neighbours are nearly right too."""
     grammar = build_answer_grammar(tokenizer, arms, style)
     # A gripper status is a free slot as well, but of two values only.

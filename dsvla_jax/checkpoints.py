@@ -90,7 +90,7 @@ class RunCheckpoints:
         where = self.folder / str(step)
         stored = self._manager.item_metadata(step)["trainable"]
         require_same_shapes(stored, trainable, where)
-        items = {"trainable": ocp.args.StandardRestore(_abstract(trainable))}
+        items: dict[str, ocp.args.CheckpointArgs] = {"trainable": ocp.args.StandardRestore(_abstract(trainable))}
         if optimizer is not None:
             items["optimizer"] = ocp.args.StandardRestore(_abstract(optimizer))
             items["iterator"] = ocp.args.JsonRestore()

@@ -20,7 +20,7 @@ def fail_with_message() -> Iterator[None]:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
-        print("stopped; the same command with --resume goes on from the last checkpoint", file=sys.stderr)
+        print("stopped; nothing that was finished is lost", file=sys.stderr)
         sys.exit(130)
 
 

@@ -95,11 +95,15 @@ def load_policy(run: Path) -> Policy:
     """
     file = run / "policy.json"
     if not file.exists():
-        raise CheckpointError(f"{run}: no run here (policy.json is missing); train one: python train.py CONFIG --run {run}")
+        raise CheckpointError(
+            f"{run}: no run here (policy.json is missing); train one: python train.py CONFIG --run {run}"
+        )
     try:
         config = cattrs.Converter(forbid_extra_keys=True).structure(json.loads(file.read_text()), PolicyConfig)
     except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
-        raise CheckpointError(f"{file}: not a policy of this version of dsvla_jax ({error}); train the run again") from error
+        raise CheckpointError(
+            f"{file}: not a policy of this version of dsvla_jax ({error}); train the run again"
+        ) from error
     tokenizer = WordTokenizer.load(run / "tokenizer.json")
     like = jax.eval_shape(lambda: initialize(config.model, jax.random.key(0)))
     checkpoints = RunCheckpoints(run)

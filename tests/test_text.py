@@ -191,7 +191,7 @@ def test_grammar_admits_exactly_the_well_formed_answers(arms, style, tokenizer):
         tokens = [*tokenizer.encode(format_answer(random_integers(arms, seed), style)), tokenizer.eos_id]
         assert len(tokens) == len(forced)
         assert allowed[np.arange(len(tokens)), tokens].all()
-    # Every choice of admitted tokens parses (but for an all-zero quaternion), and nothing else is admitted: each free
+    # Every choice of admitted tokens parses, and nothing else is admitted: each free
     # place has exactly the integers of its slot, each forced place exactly one token.
     slots = [piece for piece in answer_pieces(arms, style) if isinstance(piece, Slot)]
     assert [allowed[place].sum() for place in np.flatnonzero(forced < 0)] == [s.high - s.low + 1 for s in slots]

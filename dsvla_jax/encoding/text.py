@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -147,8 +146,8 @@ class AnswerGrammar:
     allowed: bool (L, V), True for the tokens that may stand there (one-hot where forced).
     """
 
-    forced: Array
-    allowed: Array
+    forced: np.ndarray | Array
+    allowed: np.ndarray | Array
 
 
 def build_answer_grammar(tokenizer: Tokenizer, num_arms: int, style: Style) -> AnswerGrammar:
@@ -178,7 +177,8 @@ def build_answer_grammar(tokenizer: Tokenizer, num_arms: int, style: Style) -> A
     allowed = np.zeros((len(forced), tokenizer.vocab_size), bool)
     for place, tokens in enumerate(choices):
         allowed[place, tokens] = True
-    return AnswerGrammar(forced=jnp.asarray(forced, jnp.int32), allowed=jnp.asarray(allowed))
+    # NumPy's, not JAX's: the form of an answer must stay concrete when this is called inside a jitted function.
+    return AnswerGrammar(forced=np.asarray(forced, np.int32), allowed=allowed)
 
 
 def _single_token(tokenizer: Tokenizer, number: int) -> int:

@@ -7,8 +7,8 @@ from typing import Literal
 
 import cattrs
 
-from dsvla_jax.errors import UserError
 from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
 
 
@@ -24,7 +24,7 @@ class DataConfig:
     """Rendered pixels a side."""
     seed: int = 0
     perturb: float = 0.03
-    """Metres by which half of the recorded poses leave the expert's path, each still labelled with the expert's next pose."""
+    """Metres by which half of the key poses are missed on purpose, so that the next sample starts off the path."""
     shift_world: float = 0.0
     """Metres: pose, keypoints, target and camera are moved by one random offset, so the picture stays true."""
     state_jitter: float = 0.0
@@ -73,7 +73,7 @@ class Experiment:
     steps: int = 1000
     batch_size: int = 32
     soft_target_sigma: float = 0.0
-    """Width, in bins, of the Gaussian that replaces one-hot targets on number tokens; 0 is the paper's cross-entropy."""
+    """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0
     log_every: int = 20
     checkpoint_every: int = 250

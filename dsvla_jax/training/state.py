@@ -1,6 +1,7 @@
 """The training step as a pure function, and the state that it carries."""
 
 from collections.abc import Callable
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from dsvla_jax.model.vla import VLA
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
 from dsvla_jax.training.objective import answer_loss, target_distributions
 from dsvla_jax.types import Array, Camera, ModelInputs, Observation
+
 
 @struct.dataclass
 class TrainState:
@@ -77,7 +79,7 @@ def make_train_step(
 
         (_, metrics), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
         updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.trainable)
-        trainable = optax.apply_updates(state.trainable, updates)
+        trainable = cast(Variables, optax.apply_updates(state.trainable, updates))
         metrics["gradient_norm"] = optax.global_norm(gradients)
         return TrainState(state.step + 1, trainable, optimizer_state), metrics
 

@@ -2,6 +2,7 @@
 
 import difflib
 
+from dsvla_jax.errors import UserError
 from dsvla_jax.sim.tasks import bimanual_lift_ball, close_fridge, lamp_on, put_rubbish_in_bin
 from dsvla_jax.sim.tasks.task import Graspable, Placement, StateLayout, StateView, Task
 
@@ -13,9 +14,9 @@ TASKS: dict[str, Task] = {
 
 
 def get_task(name: str) -> Task:
-    """The task of that name."""
+    """The task of that name. Raises UserError with the nearest name where there is none."""
     if name not in TASKS:
         close = difflib.get_close_matches(name, TASKS, n=1)
         hint = f"did you mean {close[0]!r}?" if close else "see dsvla_jax.sim.tasks.TASKS."
-        raise ValueError(f"unknown task {name!r}: {hint} The tasks are {', '.join(TASKS)}.")
+        raise UserError(f"unknown task {name!r}: {hint} The tasks are {', '.join(TASKS)}.")
     return TASKS[name]

@@ -1,0 +1,43 @@
+"""Draws the README's picture, one scripted demonstration a task: python -m docs.pictures"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dsvla_jax.command_line import configure_jax
+from dsvla_jax.report import film_strip, mark_targets
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.tasks import TASKS
+from dsvla_jax.types import Action
+
+SIZE, COLUMNS = 224, 5
+
+
+def demonstration(name: str) -> np.ndarray:
+    """A film strip of the expert at work, each next target marked."""
+    environment = Environment(name, image_size=SIZE)
+    state = environment.reset(episode_keys(1, "validation", name, 0, 1))
+    plan = environment.expert(state)
+    frames = []
+    for m in range(plan.pose.shape[1]):
+        picture = np.asarray(environment.observe(state).rgb[0])
+        frames.append(mark_targets(picture, plan.pose[0, m, :, :3], environment.camera))
+        state = environment.execute(state, Action(plan.pose[:, m], plan.gripper_open[:, m]))
+    frames.append(np.asarray(environment.observe(state).rgb[0]))
+    frames += [np.full_like(frames[0], 255)] * (COLUMNS - len(frames))
+    return film_strip(frames)
+
+
+def main() -> None:
+    configure_jax()
+    strips = [demonstration(name) for name in TASKS]
+    path = Path(__file__).parent / "images" / "episodes.png"
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), np.concatenate(strips)[..., ::-1])
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

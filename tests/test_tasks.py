@@ -1,0 +1,78 @@
+"""Every task: its expert succeeds, doing nothing does not, and what an episode needs is in view and within reach."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.expert_success import run_expert
+from dsvla_jax.errors import UserError
+from dsvla_jax.geometry.cameras import project
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.tasks import TASKS, get_task
+from dsvla_jax.types import TABLE_HEIGHT, Action
+
+EPISODES = 8
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def environment(request) -> Environment:
+    return Environment(request.param, image_size=96)
+
+
+def keys_of(environment: Environment):
+    return episode_keys(7, "validation", environment.task.name, 0, EPISODES)
+
+
+def test_expert_succeeds_and_doing_nothing_does_not(environment: Environment):
+    outcome = run_expert(environment, keys_of(environment))
+    assert outcome["expert"].sum() >= EPISODES - 1
+    assert not outcome["at reset"].any()
+    assert not outcome["idle"].any()
+
+
+def test_keypoints_are_in_view_and_above_the_table(environment: Environment):
+    state = environment.reset(keys_of(environment))
+    keypoints = np.asarray(environment.keypoints(state))
+    assert keypoints.shape[:2] == (EPISODES, environment.num_arms)
+    pixels, depth = project(jnp.asarray(keypoints), environment.camera)
+    assert (np.asarray(depth) > 0).all()
+    assert (np.asarray(pixels) >= 0).all()
+    assert (np.asarray(pixels) < 96).all()
+    assert (keypoints[..., 2] > TABLE_HEIGHT).all()
+
+
+def test_episodes_differ_and_repeat_by_seed(environment: Environment):
+    keys = keys_of(environment)
+    first, again = (np.asarray(environment.keypoints(environment.reset(keys))) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(np.unique(first.reshape(EPISODES, -1).round(4), axis=0)) == EPISODES
+
+
+def test_the_wrong_object_in_the_bin_is_no_success():
+    environment = Environment("put_rubbish_in_bin")
+    start = environment.reset(keys_of(environment))
+    plan = environment.expert(start)
+    view = environment.scene.view
+    tomato = np.stack(
+        [
+            np.asarray(view(start.qpos[i], start.mocap_pos[i], start.mocap_quat[i]).body_pose("rubbish_tomato_left"))
+            for i in range(EPISODES)
+        ]
+    )
+    rubbish = np.asarray(plan.pose)[:, 1, 0, :2]
+    shift = np.zeros((EPISODES, 3), np.float32)
+    shift[:, :2] = tomato[:, :2] - rubbish
+    state = start
+    for m in range(plan.pose.shape[1]):
+        # The same motions around the tomato; the bin's is the last.
+        offset = shift if m < plan.pose.shape[1] - 1 else np.zeros_like(shift)
+        pose = np.asarray(plan.pose[:, m]).copy()
+        pose[..., :3] += offset[:, None]
+        state = environment.execute(state, Action(jnp.asarray(pose), plan.gripper_open[:, m]))
+    assert not np.asarray(environment.success(state)).any()
+
+
+def test_unknown_task_names_the_nearest():
+    with pytest.raises(UserError, match=r"unknown task 'lamp_of': did you mean 'lamp_on'\?"):
+        get_task("lamp_of")
