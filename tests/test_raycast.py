@@ -52,7 +52,7 @@ def test_all_primitives_agree_with_mujocos_rays(camera, seed):
     drawn = {int(model.geom_type[i]) for i in np.unique(segmentation) if i >= 0}
     assert drawn == {raycast.PLANE, raycast.SPHERE, raycast.ELLIPSOID, raycast.CAPSULE, raycast.CYLINDER, raycast.BOX}
     parity = compare(segmentation, depth, *mujoco_rays(model, data, camera, SIZE))
-    assert parity.agreement - parity.ties >= 0.999
+    assert parity.agreement >= 0.999
     assert parity.depth_p99 < 1e-3
 
 

@@ -26,12 +26,15 @@ def _build(spec) -> None:
     silver, inside, dark = [0.75, 0.77, 0.8, 1], [0.93, 0.95, 0.97, 1], [0.2, 0.2, 0.22, 1]
     x, y, wall, middle = WIDTH / 2, DEPTH / 2 + THICKNESS, 0.006, (HEIGHT + SPLIT) / 2
     upper = (HEIGHT - SPLIT) / 2
+    # The parts abut: where two surfaces coincide, which of them is seen is an accident.
+    side_size, side_middle = upper - wall, middle - wall
     task.add_part(root, "fridge_lower", task.BOX, [x, DEPTH / 2, SPLIT / 2], [x, y, SPLIT / 2], silver, FIXTURE)
     task.add_part(root, "fridge_top", task.BOX, [x, DEPTH / 2, wall], [x, y, HEIGHT - wall], silver, FIXTURE)
     for i, side in enumerate((wall, WIDTH - wall)):
-        task.add_part(root, f"fridge_side{i}", task.BOX, [wall, DEPTH / 2, upper], [side, y, middle], silver)
-    task.add_part(root, "fridge_back", task.BOX, [x, wall, upper], [x, THICKNESS + DEPTH - wall, middle], inside)
-    task.add_part(root, "fridge_shelf", task.BOX, [x, DEPTH / 2 - 0.01, 0.003], [x, y, middle], inside)
+        task.add_part(root, f"fridge_side{i}", task.BOX, [wall, DEPTH / 2, side_size], [side, y, side_middle], silver)
+    back = [x - 2 * wall, wall, side_size]
+    task.add_part(root, "fridge_back", task.BOX, back, [x, THICKNESS + DEPTH - wall, side_middle], inside)
+    task.add_part(root, "fridge_shelf", task.BOX, [x - 2 * wall, DEPTH / 2 - 0.015, 0.003], [x, y, middle], inside)
     task.add_part(root, "fridge_bottle", task.CYLINDER, [0.02, 0.035], [x, y, SPLIT + 0.035], [0.2, 0.6, 0.25, 1])
     task.add_part(root, "fridge_lower_door", task.BOX, [x, THICKNESS, SPLIT / 2 - 0.004], [x, 0, SPLIT / 2], silver)
     task.add_part(root, "fridge_lower_handle", task.CAPSULE, [0.008, 0.04], [HANDLE, -0.025, SPLIT - 0.07], dark)

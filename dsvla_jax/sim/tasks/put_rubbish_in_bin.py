@@ -22,12 +22,12 @@ OBJECTS = ("rubbish", "rubbish_tomato_left", "rubbish_tomato_right")
 def _build(spec) -> None:
     bin_body = task.add_furniture(spec, "rubbish_bin")
     black = [0.12, 0.12, 0.13, 1]
-    middle, half = INSIDE + WALL, INSIDE + 2 * WALL
+    middle, outer = INSIDE + WALL, INSIDE + 2 * WALL
     for i, (x, y) in enumerate(((middle, 0), (-middle, 0), (0, middle), (0, -middle))):
-        size = [WALL, half, HEIGHT / 2] if x else [half, WALL, HEIGHT / 2]
+        size = [WALL, outer, HEIGHT / 2] if x else [INSIDE, WALL, HEIGHT / 2]
         task.add_part(bin_body, f"rubbish_bin_wall{i}", task.BOX, size, [x, y, HEIGHT / 2], black, FIXTURE)
     # What falls in lies on the table's plane: the bottom is only looked at.
-    task.add_part(bin_body, "rubbish_bin_bottom", task.BOX, [half, half, 0.001], [0, 0, 0.001], black)
+    task.add_part(bin_body, "rubbish_bin_bottom", task.BOX, [INSIDE, INSIDE, 0.001], [0, 0, 0.001], black)
 
     rubbish = task.add_object(spec, "rubbish", RUBBISH, damping=1e-4)
     white = [0.95, 0.95, 0.95, 1]
