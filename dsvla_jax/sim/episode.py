@@ -53,7 +53,6 @@ class Environment:
         self._success_fn = self._holds  # one object, as it is a key of compiled programs
 
         self._place = jax.jit(jax.vmap(lambda key: self.scene.place(self.task.sample(key))))
-        self._observe = jax.jit(jax.vmap(self._observe_one))
         self._render = jax.jit(jax.vmap(self._render_one))
         self._end_effector = jax.jit(jax.vmap(lambda qpos: controller.end_effector(qpos, self._arms)))
         self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
@@ -106,7 +105,10 @@ class Environment:
 
     def observe(self, state: SimState) -> Observation:
         """What a policy sees of the B episodes; every field with the batch in front, the camera's too."""
-        return self._observe(state)
+        rgb, depth, _ = self.render(state)
+        pose, gripper_open = self.end_effector(state)
+        camera = jax.tree.map(lambda x: jnp.broadcast_to(x, (rgb.shape[0], *x.shape)), self.camera)
+        return Observation(rgb=rgb, depth=depth, camera=camera, pose=pose, gripper_open=gripper_open)
 
     def render(self, state: SimState) -> tuple[Array, Array, Array]:
         """rgb uint8 (B, H, W, 3), depth float32 (B, H, W) metres, segmentation int32 (B, H, W), geom ids, -1 sky."""
@@ -175,8 +177,3 @@ class Environment:
             self.image_size,
             shadows=self._shadows,
         )
-
-    def _observe_one(self, state: SimState) -> Observation:
-        rgb, depth, _ = self._render_one(state.geom_xpos, state.geom_xmat, state.geom_rgba)
-        pose, gripper_open = controller.end_effector(state.qpos, self._arms)
-        return Observation(rgb=rgb, depth=depth, camera=self.camera, pose=pose, gripper_open=gripper_open)
