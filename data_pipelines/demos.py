@@ -175,7 +175,8 @@ def generate_demonstrations(
             while kept < episodes:
                 name = f"{task}-{number:05d}.array_record"
                 entry = entries.get(name)
-                if entry is None or (entry["cut"] and kept + len(entry["frames"]) < episodes) or damaged(folder, entry):
+                too_short = entry is not None and entry["cut"] and kept + len(entry["frames"]) < episodes
+                if entry is None or too_short or is_missing(folder, entry):
                     if demonstrate is None:
                         bar.set_postfix_str(f"{task}: the first batch compiles")
                         demonstrate = demonstrator(task, wanted)
@@ -212,12 +213,12 @@ def existing_shards(folder: Path, wanted: Settings) -> list[dict[str, Any]]:
     return index["shards"]
 
 
-def damaged(folder: Path, entry: dict[str, Any]) -> bool:
-    """Whether a shard is missing or not what the index says."""
-    try:
-        check_shard(folder, entry, digest=True)
-    except DataError:
+def is_missing(folder: Path, entry: dict[str, Any]) -> bool:
+    """Whether a shard of the index is gone. Raises DataError for one that is there but damaged: nobody's file is
+    overwritten unasked."""
+    if not (folder / entry["file"]).exists():
         return True
+    check_shard(folder, entry, digest=True)
     return False
 
 

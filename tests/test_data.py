@@ -335,7 +335,7 @@ def test_interrupted_generation_continues_where_it_stopped(tmp_path):
     assert rest.starts == []
 
 
-def test_more_episodes_and_damaged_shards_are_made_again(tmp_path):
+def test_more_episodes_and_missing_shards_are_made_but_damaged_ones_are_refused(tmp_path):
     small, large = tmp_path / "small", tmp_path / "large"
     generate_demonstrations(large, ["lamp_on"], 9, demonstrator=FakeExpert(), batch=4, progress=False)
     generate_demonstrations(small, ["lamp_on"], 4, demonstrator=FakeExpert(), batch=4, progress=False)
@@ -346,6 +346,10 @@ def test_more_episodes_and_damaged_shards_are_made_again(tmp_path):
     shard = small / "lamp_on-00001.array_record"
     shard.write_bytes(shard.read_bytes()[:1000])
     again = FakeExpert()
+    with pytest.raises(DataError, match=r"lamp_on-00001.array_record: size: .*delete it and run the program"):
+        generate_demonstrations(small, ["lamp_on"], 9, demonstrator=again, batch=4, progress=False)
+    assert shard.stat().st_size == 1000
+    shard.unlink()
     generate_demonstrations(small, ["lamp_on"], 9, demonstrator=again, batch=4, progress=False)
     assert again.starts == [("lamp_on", 4)]
     assert contents(small) == contents(large)
