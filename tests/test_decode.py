@@ -1,5 +1,6 @@
 """Decoding: the cache against the full forward pass, independence of batch-mates, well-formed answers."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -57,7 +58,7 @@ def teacher_forced_logits(variables, prompts, answers):
     texts = np.zeros((len(lengths), lengths.max() + answers.shape[1]), np.int32)
     for row, prompt, length, answer in zip(texts, np.asarray(prompts.text_tokens), lengths, answers, strict=True):
         row[: length + len(answer)] = [*prompt[:length], *answer]
-    inputs = prompts.replace(text_tokens=jnp.asarray(texts), text_mask=jnp.ones(texts.shape, bool))
+    inputs = dataclasses.replace(prompts, text_tokens=jnp.asarray(texts), text_mask=jnp.ones(texts.shape, bool))
     logits = jax.jit(VLA(CONFIG).apply)(variables, inputs)
     return jnp.stack([row[n - 1 : n - 1 + answers.shape[1]] for row, n in zip(logits, lengths, strict=True)])
 
@@ -78,7 +79,7 @@ def test_prefill_and_extend_give_the_logits_of_the_full_forward_pass(variables):
     model, prompts = VLA(CONFIG), make_prompts(np.array([9, 9]))
     full = jax.jit(model.apply)(variables, prompts)
     extend = jax.jit(lambda *args: model.apply(variables, *args, method="extend"))
-    head = prompts.replace(text_tokens=prompts.text_tokens[:, :4], text_mask=prompts.text_mask[:, :4])
+    head = dataclasses.replace(prompts, text_tokens=prompts.text_tokens[:, :4], text_mask=prompts.text_mask[:, :4])
     logits, cache = jax.jit(lambda head: model.apply(variables, head, 5, method="prefill"))(head)
     np.testing.assert_allclose(logits, full[:, 3], atol=1e-4)
     slots = cache.keys.shape[3]
@@ -97,12 +98,14 @@ def test_padding_and_batch_mates_never_change_an_answer(variables):
     tokens, log_probs = decode(variables, prompts)
     for b, length in list(enumerate(PROMPT_LENGTHS))[1:]:
         alone = jax.tree.map(lambda x, b=b: x[b : b + 1], prompts)
-        alone = alone.replace(text_tokens=alone.text_tokens[:, :length], text_mask=alone.text_mask[:, :length])
+        alone = dataclasses.replace(
+            alone, text_tokens=alone.text_tokens[:, :length], text_mask=alone.text_mask[:, :length]
+        )
         lonely_tokens, lonely_log_probs = decode(variables, alone)
         np.testing.assert_array_equal(lonely_tokens[0], tokens[b])
         np.testing.assert_allclose(lonely_log_probs[0], log_probs[b], atol=1e-4)
     # What stands in the padding is never read.
-    scribbled = prompts.replace(text_tokens=jnp.where(prompts.text_mask, prompts.text_tokens, 3))
+    scribbled = dataclasses.replace(prompts, text_tokens=jnp.where(prompts.text_mask, prompts.text_tokens, 3))
     np.testing.assert_array_equal(decode(variables, scribbled)[1], log_probs)
     # Other batch-mates, same shapes: the very same numbers.
     others = jax.tree.map(lambda x, y: x.at[1:].set(y[1:]), prompts, make_prompts(seed=5))

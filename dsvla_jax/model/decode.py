@@ -5,6 +5,7 @@ that its grammar allows. The prompt is read once into a key/value cache; then ea
 which reads the chosen token together with the template tokens that follow it. Greedy, hence deterministic.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -122,7 +123,7 @@ def _append(inputs: ModelInputs, tokens: np.ndarray) -> ModelInputs:
     text = jnp.pad(inputs.text_tokens, ((0, 0), (0, count)))
     behind = jnp.arange(text.shape[1])[None] - inputs.text_mask.sum(axis=1, keepdims=True)
     text = jnp.where((behind >= 0) & (behind < count), jnp.asarray(tokens)[jnp.clip(behind, 0, count - 1)], text)
-    return inputs.replace(text_tokens=text, text_mask=behind < count)  # pyright: ignore[reportAttributeAccessIssue]
+    return dataclasses.replace(inputs, text_tokens=text, text_mask=behind < count)
 
 
 def _runs(free: np.ndarray) -> list[tuple[int, int, int]]:

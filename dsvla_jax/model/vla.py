@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dsvla_jax.model.clip import Projector, VisionTower
-from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.llama import KVCache, Llama
 from dsvla_jax.types import ModelInputs
 
@@ -109,9 +109,14 @@ def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Arra
         text_tokens=jnp.zeros((1, 2), jnp.int32),
         text_mask=jnp.ones((1, 2), bool),
     )
-    variables = jax.jit(VLA(config).init)(key, inputs)
-    if number_values is None:
-        return variables
+    variables = dict(jax.jit(VLA(config).init)(key, inputs))
+    if number_values is not None:
+        variables["params"] = embed_numbers(variables["params"], language, number_values)
+    return variables
+
+
+def embed_numbers(params: dict, language: LanguageConfig, number_values: np.ndarray | Array) -> dict:
+    """Parameters whose number tokens are embedded by value, see ``initialize``."""
     values = jnp.asarray(number_values, jnp.float32)
     if values.shape != (language.vocab_size,):
         raise ValueError(
@@ -120,10 +125,8 @@ def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Arra
         )
     is_number = ~jnp.isnan(values)[:, None]
     features = number_embeddings(jnp.nan_to_num(values), language.width) * language.width**-0.5
-    params = dict(variables["params"])
     tables = dict(params["language"])
     tables["embedding"] = jnp.where(is_number, features, tables["embedding"])
     if not language.tie_embeddings:
         tables["output"] = jnp.where(is_number.T, features.T, tables["output"])
-    params["language"] = tables
-    return {**variables, "params": params}
+    return {**params, "language": tables}
