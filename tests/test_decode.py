@@ -1,20 +1,23 @@
 """Decoding: the cache against the full forward pass, independence of batch-mates, well-formed answers."""
 
 import dataclasses
-from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dsvla_jax.encoding.prompts import STYLES, parse_answer
+from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar, vocabulary
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.decode import decode_actions, make_decoder
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
 
-VOCAB = 40
-EOS = 2
+TOKENIZER = WordTokenizer(vocabulary([]))
+VOCAB = TOKENIZER.vocab_size
+EOS = TOKENIZER.eos_id
 CONFIG = ModelConfig(
     vision=VisionConfig(image_size=16, patch_size=8, width=32, layers=1, heads=4),
     language=LanguageConfig(vocab_size=VOCAB, width=32, layers=2, heads=4, kv_heads=2, ffn=48),
@@ -25,9 +28,24 @@ FORCED = np.array([5, 6, -1, 7, -1, 7, -1, 8, 9, -1, -1, EOS], np.int32)
 PROMPT_LENGTHS = np.array([9, 4, 1])
 
 
+class Grammar(NamedTuple):
+    forced: np.ndarray
+    allowed: np.ndarray
+    forbidden: np.ndarray = np.zeros((0, 0), np.int32)
+
+
 def make_grammar(forced=FORCED, seed=0):
     allowed = np.random.default_rng(seed).random((len(forced), VOCAB)) < 0.4
-    return SimpleNamespace(forced=forced, allowed=allowed)
+    return Grammar(forced, allowed, np.zeros((0, len(forced)), np.int32))
+
+
+def action_grammar(num_arms, style):
+    """The grammar of real answers, with quaternions of four zeros forbidden."""
+    grammar = build_answer_grammar(TOKENIZER, num_arms, style)
+    free = np.flatnonzero(np.asarray(grammar.forced) < 0).reshape(num_arms, 8)
+    forbidden = np.full((num_arms, len(grammar.forced)), -1, np.int32)
+    np.put_along_axis(forbidden, free[:, 3:7], TOKENIZER.encode("0")[0], axis=1)
+    return Grammar(np.asarray(grammar.forced), np.asarray(grammar.allowed), forbidden)
 
 
 def make_prompts(lengths=PROMPT_LENGTHS, padded=9, seed=0) -> ModelInputs:
@@ -113,20 +131,34 @@ def test_padding_and_batch_mates_never_change_an_answer(variables):
     np.testing.assert_array_equal(decode(variables, others)[1][0], log_probs[0])
 
 
-def test_a_thousand_decodes_of_random_weights_follow_the_grammar(variables):
-    grammar = make_grammar()
-    decode = make_decoder(VLA(CONFIG), grammar)
+@pytest.mark.parametrize("style", STYLES)
+def test_random_weights_give_well_formed_actions(variables, style):
+    arms = {"compact": 1, "paper": 2}[style]
+    decode = make_decoder(VLA(CONFIG), action_grammar(arms, style))
     seen = set()
-    for seed in range(4):
-        lengths = np.random.default_rng(seed).integers(1, 10, 250)
+    for seed in range(5):
+        lengths = np.random.default_rng(seed).integers(1, 10, 100)
         weights = jax.tree.map(lambda x, s=seed: x * (1.0 + s), variables)
-        tokens = np.asarray(decode(weights, make_prompts(lengths, seed=seed))[0])
-        template = FORCED >= 0
-        assert (tokens[:, template] == FORCED[template]).all()
-        for slot in np.flatnonzero(~template):
-            assert grammar.allowed[slot, tokens[:, slot]].all()
-        seen.update(map(tuple, tokens))
+        for answer in np.asarray(decode(weights, make_prompts(lengths, seed=seed))[0]):
+            assert answer[-1] == EOS
+            seen.add(parse_answer(TOKENIZER.decode(answer), arms, style).tobytes())
     assert len(seen) > 50
+
+
+def test_forbidden_combinations_never_come_out(variables):
+    # An embedding that always answers "0" wherever that is allowed.
+    zero = TOKENIZER.encode("0")[0]
+    params = jax.tree.map(jnp.zeros_like, variables["params"])
+    params["language"]["norm"]["scale"] = jnp.ones(32)
+    params["language"]["embedding"] = jnp.ones((VOCAB, 32))
+    params["language"]["output"] = jnp.zeros((32, VOCAB)).at[:, zero].set(1.0).at[:, zero + 9].set(0.5)
+    grammar = action_grammar(1, "compact")
+    tokens, log_probs = make_decoder(VLA(CONFIG), grammar)({"params": params}, make_prompts())
+    expected = np.zeros((1, 8), int)
+    expected[0, 6] = 9
+    for answer in np.asarray(tokens):
+        np.testing.assert_array_equal(parse_answer(TOKENIZER.decode(answer), 1, "compact"), expected)
+    assert np.isfinite(log_probs).all()
 
 
 def test_a_template_without_free_slots_costs_nothing():
@@ -138,9 +170,9 @@ def test_a_template_without_free_slots_costs_nothing():
 @pytest.mark.parametrize(
     ("grammar", "message"),
     [
-        (SimpleNamespace(forced=np.array([-1]), allowed=np.ones((1, 7), bool)), "vocabulary of 7 tokens"),
-        (SimpleNamespace(forced=np.array([-1]), allowed=np.zeros((1, VOCAB), bool)), r"free slots \[0\]"),
-        (SimpleNamespace(forced=np.array([-1]), allowed=np.ones((2, VOCAB), bool)), "expected forced"),
+        (Grammar(np.array([-1]), np.ones((1, 7), bool)), "vocabulary of 7 tokens"),
+        (Grammar(np.array([-1]), np.zeros((1, VOCAB), bool)), r"free slots \[0\]"),
+        (Grammar(np.array([-1]), np.ones((2, VOCAB), bool)), "expected forced"),
     ],
 )
 def test_impossible_grammars_say_why(variables, grammar, message):

@@ -1,6 +1,7 @@
 """The network: towers, adapters, initialisation. Tiny random weights throughout."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -114,7 +115,8 @@ def test_3d_token_carries_its_patch_positional_embedding(variables):
     params = variables["params"]
     positions = params["vision"]["positional_embedding"]
     encode = jax.jit(lambda p, i: VLA(CONFIG).apply({"params": p}, i, method="encode_vision"))
-    moved = inputs.replace(
+    moved = dataclasses.replace(
+        inputs,
         point_tokens=inputs.point_tokens + positions[1 + inputs.point_patches] - positions[1 + 0],
         point_patches=jnp.zeros_like(inputs.point_patches),
     )
@@ -142,7 +144,8 @@ def test_attention_equals_loops_in_numpy():
         weights = np.where(mask[b, t], np.exp(scores), 0)
         expected[b, h, t] = weights @ value[b, h // 2] / weights.sum()
     for implementation in ("by_hand", "fused"):
-        result = attend(*map(jnp.asarray, (query, key, value)), jnp.asarray(mask), implementation)
+        arrays = jnp.asarray(query), jnp.asarray(key), jnp.asarray(value), jnp.asarray(mask)
+        result = attend(*arrays, implementation)
         np.testing.assert_allclose(result, expected, atol=1e-5)
 
 
@@ -170,7 +173,8 @@ def lora_gradient(config, variables):
     @jax.jit
     def run(variables, inputs):
         def loss(lora):
-            return jnp.square(VLA(config).apply({"params": variables["params"], "lora": lora}, inputs)).mean()
+            logits: Any = VLA(config).apply({"params": variables["params"], "lora": lora}, inputs)
+            return jnp.square(logits).mean()
 
         return jax.value_and_grad(loss)(variables["lora"])
 
@@ -202,7 +206,7 @@ def test_fresh_adapters_change_nothing(forward, variables):
 @pytest.mark.parametrize(("init", "std"), [("kaiming", (3 * 48) ** -0.5), ("normal", 0.02)])
 def test_a_is_random_and_b_zero(init, std):
     layer = LoraDense(20, lora=LoraConfig(rank=30, init=init), name="q")
-    adapter = layer.init(jax.random.key(1), jnp.zeros((1, 48)))["lora"]
+    adapter: Any = layer.init(jax.random.key(1), jnp.zeros((1, 48)))["lora"]
     assert adapter["a"].shape == (48, 30)
     np.testing.assert_allclose(adapter["a"].std(), std, rtol=0.1)
     assert adapter["b"].shape == (30, 20)

@@ -5,6 +5,8 @@ carries the positional embedding of the patch that its centre projects onto (2D-
 pretrained encoder needs no new parameters for it.
 """
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -56,7 +58,7 @@ class VisionBlock(nn.Module):
         return x, None
 
 
-def over_layers(block, config: ModelConfig, layers: int, in_axes=nn.broadcast, out_axes=0):
+def over_layers(block, config: ModelConfig, layers: int, in_axes: Any = nn.broadcast) -> Any:
     """``block`` scanned over ``layers``: its variables get a leading layers axis; rematerialised as the config says."""
     if config.remat != "none":
         policy = jax.checkpoint_policies.dots_with_no_batch_dims_saveable if config.remat == "dots" else None
@@ -66,7 +68,6 @@ def over_layers(block, config: ModelConfig, layers: int, in_axes=nn.broadcast, o
         variable_axes={"params": 0, "lora": 0},
         split_rngs={"params": True},
         in_axes=in_axes,
-        out_axes=out_axes,
         length=layers,
         unroll=config.scan_unroll,
     )

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,6 +25,8 @@ class Grammar(Protocol):
     """The form of an answer, as ``dsvla_jax.encoding.text.build_answer_grammar`` makes it.
 
     forced: int32 (L,), the template's token, -1 where the slot is free. allowed: bool (L, V), read at free slots.
+    forbidden, optional: int32 (R, L), combinations that must not come out, such as a quaternion of four zeros. A row
+        holds tokens at free slots and -1 elsewhere; an answer never has all the tokens of a row.
     """
 
     @property
@@ -41,7 +44,7 @@ def decode_actions(model: VLA, variables: Any, inputs: ModelInputs, grammar: Gra
         (``make_decoder`` does).
     A log-probability is that among the allowed tokens of the slot; it is 0 for forced tokens.
     """
-    forced, allowed = _concrete(grammar)
+    forced, allowed, forbidden = _concrete(grammar)
     length = forced.shape[0]
     batch = inputs.text_tokens.shape[0]
     answer = jnp.broadcast_to(jnp.asarray(forced), (batch, length))
@@ -56,43 +59,48 @@ def decode_actions(model: VLA, variables: Any, inputs: ModelInputs, grammar: Gra
         )
 
     lead = int(free[0])
+    fed = int(free[-1]) - lead  # the answer's tokens that are ever read
     prompt = _append(inputs, forced[:lead])
-    logits, cache = model.apply(variables, prompt, int(free[-1]) - lead, method="prefill")
-    start = cache.keys.shape[3] - (int(free[-1]) - lead)
+    prefilled: Any = model.apply(variables, prompt, fed, method="prefill")
+    logits, cache = prefilled
+    slots = jnp.arange(cache.keys.shape[3])
+    start = cache.keys.shape[3] - fed
     visual_tokens = start - prompt.text_tokens.shape[1]
     prompt_lengths = visual_tokens + prompt.text_mask.sum(axis=1).astype(jnp.int32)
-    slots = jnp.arange(cache.keys.shape[3])
     in_prompt = slots[None, :] < prompt_lengths[:, None]
 
-    def read(cache: KVCache, tokens: Array, offset: Array) -> tuple[Array, KVCache]:
+    def choose(logits: Array, answer: Array, place: Array | int) -> tuple[Array, Array]:
+        permitted = jnp.asarray(allowed)[place] & ~_completes(jnp.asarray(forbidden), answer, place, allowed.shape[1])
+        logits = jnp.where(permitted, logits, -jnp.inf)
+        token = jnp.argmax(logits, axis=-1).astype(jnp.int32)
+        log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), token[:, None], axis=-1)[:, 0]
+        return answer.at[:, place].set(token), log_prob
+
+    def fill_place(carry: tuple[Array, KVCache, Array], xs: tuple[Array, Array]) -> tuple[Any, Array]:
+        logits, cache, answer = carry
+        places, offset = xs
+        answer, log_prob = choose(logits, answer, places[0])
         # Answer tokens share their slots across the batch, behind the longest prompt; positions are each example's.
-        steps = offset + jnp.arange(tokens.shape[1])
+        steps = offset + jnp.arange(places.shape[0])
         in_answer = (slots >= start) & (slots[None, :] <= start + steps[:, None])
         mask = in_prompt[:, None, :] | in_answer[None]
         positions = prompt_lengths[:, None] + steps[None]
-        return model.apply(variables, tokens, positions, mask, cache, start + offset, method="extend")
+        extended: Any = model.apply(
+            variables, answer[:, places], positions, mask, cache, start + offset, method="extend"
+        )
+        return (*extended, answer), log_prob
 
-    def fill_slot(carry: tuple[Array, KVCache], slot: tuple[Array, Array, Array]):
-        logits, cache = carry
-        slot_allowed, following, offset = slot
-        token, log_prob = _choose(logits, slot_allowed)
-        chunk = jnp.concatenate([token[:, None], jnp.broadcast_to(following, (batch, *following.shape))], axis=1)
-        logits, cache = read(cache, chunk, offset)
-        return (logits, cache), (token, log_prob)
-
-    # Slots followed by equally many template tokens run as one loop, so that compile time does not grow with them.
-    chosen, chosen_log_probs = [], []
+    # Free places followed by equally many template tokens run as one loop, so that compile time does not grow with
+    # them. Each iteration reads the place's token together with the template tokens that follow it.
+    free_log_probs = []
     for first, count, width in _runs(free):
-        rows = first + width * np.arange(count)
-        following = np.stack([forced[row + 1 : row + width] for row in rows])
-        xs = (jnp.asarray(allowed[rows]), jnp.asarray(following), jnp.asarray(rows - lead))
-        (logits, cache), (tokens, token_log_probs) = jax.lax.scan(fill_slot, (logits, cache), xs)
-        chosen.append(tokens.T)
-        chosen_log_probs.append(token_log_probs.T)
-    token, log_prob = _choose(logits, jnp.asarray(allowed[free[-1]]))
-    tokens = jnp.concatenate([*chosen, token[:, None]], axis=1)
-    token_log_probs = jnp.concatenate([*chosen_log_probs, log_prob[:, None]], axis=1)
-    return answer.at[:, free].set(tokens), log_probs.at[:, free].set(token_log_probs)
+        places = first + np.arange(count * width).reshape(count, width)
+        xs = (jnp.asarray(places), jnp.asarray(places[:, 0] - lead))
+        (logits, cache, answer), run_log_probs = jax.lax.scan(fill_place, (logits, cache, answer), xs)
+        free_log_probs.append(run_log_probs.T)
+    answer, log_prob = choose(logits, answer, int(free[-1]))
+    free_log_probs.append(log_prob[:, None])
+    return answer, log_probs.at[:, free].set(jnp.concatenate(free_log_probs, axis=1))
 
 
 def make_decoder(model: VLA, grammar: Grammar) -> Callable[[Any, ModelInputs], tuple[Array, Array]]:
@@ -100,8 +108,8 @@ def make_decoder(model: VLA, grammar: Grammar) -> Callable[[Any, ModelInputs], t
     return jax.jit(lambda variables, inputs: decode_actions(model, variables, inputs, grammar))
 
 
-def _concrete(grammar: Grammar) -> tuple[np.ndarray, np.ndarray]:
-    if isinstance(grammar.forced, jax.core.Tracer) or isinstance(grammar.allowed, jax.core.Tracer):
+def _concrete(grammar: Grammar) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in (grammar.forced, grammar.allowed)):
         raise TypeError(
             "grammar: got traced arrays; its template decides the shape of the computation, so close over the grammar "
             "instead of passing it through jax.jit (see make_decoder)"
@@ -112,7 +120,18 @@ def _concrete(grammar: Grammar) -> tuple[np.ndarray, np.ndarray]:
     empty = np.flatnonzero((forced < 0) & ~allowed.any(axis=1))
     if empty.size:
         raise ValueError(f"grammar: free slots {empty.tolist()} allow no token at all")
-    return forced, allowed
+    forbidden = np.asarray(getattr(grammar, "forbidden", np.zeros((0, len(forced)))), np.int32)
+    if forbidden.ndim != 2 or forbidden.shape[1] != len(forced):
+        raise ValueError(f"grammar: expected forbidden (R, {len(forced)}), got {forbidden.shape}")
+    return forced, allowed, forbidden
+
+
+def _completes(forbidden: Array, answer: Array, place: Array | int, vocab_size: int) -> Array:
+    """bool (B, V): the tokens which at ``place`` would complete a forbidden combination. Later places are still -1."""
+    tokens = forbidden[:, place]
+    matches = (forbidden[None] < 0) | (forbidden[None] == answer[:, None])  # (B, R, L)
+    complete = matches.at[:, :, place].set(True).all(axis=-1) & (tokens >= 0)
+    return (complete[:, :, None] & (tokens[:, None] == jnp.arange(vocab_size))).any(axis=1)
 
 
 def _append(inputs: ModelInputs, tokens: np.ndarray) -> ModelInputs:
@@ -136,11 +155,3 @@ def _runs(free: np.ndarray) -> list[tuple[int, int, int]]:
         else:
             runs.append((slot, 1, width))
     return runs
-
-
-def _choose(logits: Array, allowed: Array) -> tuple[Array, Array]:
-    """The likeliest allowed token int32 (B,) of logits (B, V), and its log-probability among the allowed."""
-    logits = jnp.where(allowed, logits, -jnp.inf)
-    token = jnp.argmax(logits, axis=-1)
-    log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), token[:, None], axis=-1)[:, 0]
-    return token.astype(jnp.int32), log_prob

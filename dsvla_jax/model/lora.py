@@ -65,8 +65,8 @@ class LoraDense(nn.Module):
 
 
 def _add_adapters(params: Mapping, adapters: Mapping, scale: float) -> dict:
-    flat = dict(traverse_util.flatten_dict(params))
-    flat_adapters = traverse_util.flatten_dict(adapters)
+    flat: dict[tuple, Any] = dict(traverse_util.flatten_dict(params))
+    flat_adapters: dict[tuple, Any] = dict(traverse_util.flatten_dict(adapters))
     for path in flat_adapters:
         if path[-1] != "a":
             continue

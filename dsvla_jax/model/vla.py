@@ -1,5 +1,7 @@
 """The assembled policy network: vision tower -> projector -> visual tokens before the text -> LLaMA -> logits."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -59,7 +61,7 @@ class VLA(nn.Module):
         batch, length, _ = x.shape
         cache = KVCache.empty(self.config, batch, length + more_slots)
         mask = positions[:, :, None] >= jnp.arange(length + more_slots)[None, None, :]
-        x, cache = self.language(x, positions, mask, cache, 0)
+        x, cache = self._continue(x, positions, mask, cache, 0)
         text_lengths = inputs.text_mask.sum(axis=1)
         last = length - inputs.text_tokens.shape[1] + text_lengths - 1
         hidden = jnp.take_along_axis(x, last[:, None, None], axis=1)[:, 0]
@@ -72,8 +74,11 @@ class VLA(nn.Module):
 
         mask: bool (B, C, S), the slots each token may look at. Returns the logits (B, V) after the last of them.
         """
-        x, cache = self.language(self.language.embed(tokens), positions, mask, cache, index)
+        x, cache = self._continue(self.language.embed(tokens), positions, mask, cache, index)
         return self.lm_head(x[:, -1]), cache
+
+    def _continue(self, x: Array, positions: Array, mask: Array, cache: KVCache, index: Array | int) -> Any:
+        return self.language(x, positions, mask, cache, index)
 
     def _sequence(self, inputs: ModelInputs) -> tuple[Array, Array]:
         visual = self.projector(self.encode_vision(inputs))
