@@ -31,7 +31,7 @@ PROMPT_LENGTHS = np.array([9, 4, 1])
 class Grammar(NamedTuple):
     forced: np.ndarray
     allowed: np.ndarray
-    forbidden: np.ndarray = np.zeros((0, 0), np.int32)
+    forbidden: np.ndarray = np.zeros((0, 1), np.int32)
 
 
 def make_grammar(forced=FORCED, seed=0):

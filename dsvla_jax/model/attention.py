@@ -29,7 +29,7 @@ def attend(query: Array, key: Array, value: Array, mask: Array | None = None, im
     Returns (B, H, T, D) in the query's dtype.
     """
     batch, heads, length, depth = query.shape
-    kv_heads, keys = key.shape[1:3]
+    kv_heads = key.shape[1]
     if implementation == "fused":
         output = jax.nn.dot_product_attention(
             query.swapaxes(1, 2),
@@ -38,11 +38,14 @@ def attend(query: Array, key: Array, value: Array, mask: Array | None = None, im
             mask=None if mask is None else mask[:, None],
         )
         return output.swapaxes(1, 2)
-    # The query heads that share a key head are laid out as more queries of it: two plain batched products.
-    grouped = (query * depth**-0.5).reshape(batch, kv_heads, -1, depth)
+    # The query heads that share a key head are laid out as more queries of it: two plain batched products. The mask is
+    # added, and the sum of the weights divided out behind the second product, because both make the gradient quicker.
+    groups = heads // kv_heads
+    grouped = (query * depth**-0.5).reshape(batch, kv_heads, groups * length, depth)
     scores = jnp.einsum("bhtd,bhsd->bhts", grouped, key, preferred_element_type=jnp.float32)
     if mask is not None:
-        scores = scores.reshape(batch, kv_heads, heads // kv_heads, length, keys)
-        scores = jnp.where(mask[:, None, None], scores, MASKED).reshape(batch, kv_heads, -1, keys)
-    weights = jax.nn.softmax(scores, axis=-1).astype(value.dtype)
-    return jnp.einsum("bhts,bhsd->bhtd", weights, value).reshape(batch, heads, length, depth)
+        scores = scores + jnp.tile(jnp.where(mask, 0.0, MASKED), (1, groups, 1))[:, None]
+    weights = jnp.exp(scores - jax.lax.stop_gradient(scores.max(axis=-1, keepdims=True)))
+    total = weights.sum(axis=-1, keepdims=True)
+    output = jnp.einsum("bhts,bhsd->bhtd", weights.astype(value.dtype), value, preferred_element_type=jnp.float32)
+    return (output / total).astype(query.dtype).reshape(batch, heads, length, depth)

@@ -105,7 +105,9 @@ class VisionTower(nn.Module):
         positions = self.param("positional_embedding", embedding_init, (1 + vision.num_patches, vision.width))
 
         batch = image.shape[0]
-        patches = patchify(image, vision.patch_size).astype(dtype) @ kernel.reshape(-1, vision.width).astype(dtype)
+        pixels = patchify(image, vision.patch_size).astype(dtype)
+        patches = pixels.reshape(-1, pixels.shape[-1]) @ kernel.reshape(-1, vision.width).astype(dtype)
+        patches = patches.reshape(batch, vision.num_patches, vision.width)
         tokens_2d = jnp.concatenate(
             [jnp.broadcast_to(class_embedding, (batch, 1, vision.width)), patches.astype(jnp.float32)], axis=1
         )

@@ -129,6 +129,9 @@ class Llama(nn.Module):
     def lm_head(self, hidden: Array) -> Array:
         """(..., width) -> float32 logits (..., V)."""
         language, dtype = self.config.language, self.config.compute_dtype
-        if language.tie_embeddings:
-            return jnp.einsum("...d,vd->...v", hidden, self.embedding.astype(dtype), preferred_element_type=jnp.float32)
-        return jnp.einsum("...d,dv->...v", hidden, self.output.astype(dtype), preferred_element_type=jnp.float32)
+        table, axis = (self.embedding, 1) if language.tie_embeddings else (self.output, 0)
+        flat = hidden.reshape(-1, language.width).astype(dtype)
+        logits = jax.lax.dot_general(
+            flat, table.astype(dtype), (((1,), (axis,)), ((), ())), preferred_element_type=jnp.float32
+        )
+        return logits.reshape(*hidden.shape[:-1], language.vocab_size)

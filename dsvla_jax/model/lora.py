@@ -48,7 +48,10 @@ class LoraDense(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         inputs = x.shape[-1]
-        x = x.astype(self.dtype)
+        # Tokens are merged into one axis: of a 3D product XLA's CPU compiler would transpose the output's gradient, and
+        # compute all that is fused into it again, for the kernel's gradient.
+        leading = x.shape[:-1]
+        x = x.reshape(-1, inputs).astype(self.dtype)
         kernel = self.param("kernel", self.kernel_init, (inputs, self.features), jnp.float32)
         y = x @ kernel.astype(self.dtype)
         if self.use_bias:
@@ -61,7 +64,7 @@ class LoraDense(nn.Module):
             a = self.variable("lora", "a", lambda: a_init(self.make_rng("params"), (inputs, lora.rank), jnp.float32))
             b = self.variable("lora", "b", lambda: jnp.zeros((lora.rank, self.features), jnp.float32))
             y = y + (x @ a.value.astype(self.dtype)) @ b.value.astype(self.dtype) * lora.scale
-        return y
+        return y.reshape(*leading, self.features)
 
 
 def _add_adapters(params: Mapping, adapters: Mapping, scale: float) -> dict:
