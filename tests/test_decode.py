@@ -39,15 +39,6 @@ def make_grammar(forced=FORCED, seed=0):
     return Grammar(forced, allowed, np.zeros((0, len(forced)), np.int32))
 
 
-def action_grammar(num_arms, style):
-    """The grammar of real answers, with quaternions of four zeros forbidden."""
-    grammar = build_answer_grammar(TOKENIZER, num_arms, style)
-    free = np.flatnonzero(np.asarray(grammar.forced) < 0).reshape(num_arms, 8)
-    forbidden = np.full((num_arms, len(grammar.forced)), -1, np.int32)
-    np.put_along_axis(forbidden, free[:, 3:7], TOKENIZER.encode("0")[0], axis=1)
-    return Grammar(np.asarray(grammar.forced), np.asarray(grammar.allowed), forbidden)
-
-
 def make_prompts(lengths=PROMPT_LENGTHS, padded=9, seed=0) -> ModelInputs:
     rng = np.random.default_rng(seed)
     batch = len(lengths)
@@ -134,7 +125,7 @@ def test_padding_and_batch_mates_never_change_an_answer(variables):
 @pytest.mark.parametrize("style", STYLES)
 def test_random_weights_give_well_formed_actions(variables, style):
     arms = {"compact": 1, "paper": 2}[style]
-    decode = make_decoder(VLA(CONFIG), action_grammar(arms, style))
+    decode = make_decoder(VLA(CONFIG), build_answer_grammar(TOKENIZER, arms, style))
     seen = set()
     for seed in range(5):
         lengths = np.random.default_rng(seed).integers(1, 10, 100)
@@ -152,7 +143,7 @@ def test_forbidden_combinations_never_come_out(variables):
     params["language"]["norm"]["scale"] = jnp.ones(32)
     params["language"]["embedding"] = jnp.ones((VOCAB, 32))
     params["language"]["output"] = jnp.zeros((32, VOCAB)).at[:, zero].set(1.0).at[:, zero + 9].set(0.5)
-    grammar = action_grammar(1, "compact")
+    grammar = build_answer_grammar(TOKENIZER, 1, "compact")
     tokens, log_probs = make_decoder(VLA(CONFIG), grammar)({"params": params}, make_prompts())
     expected = np.zeros((1, 8), int)
     expected[0, 6] = 9

@@ -191,15 +191,16 @@ def test_grammar_admits_exactly_the_well_formed_answers(arms, style, tokenizer):
         tokens = [*tokenizer.encode(format_answer(random_integers(arms, seed), style)), tokenizer.eos_id]
         assert len(tokens) == len(forced)
         assert allowed[np.arange(len(tokens)), tokens].all()
-    # Every choice of admitted tokens parses, and nothing else is admitted: each free
-    # place has exactly the integers of its slot, each forced place exactly one token.
+    # Every choice of admitted tokens parses, but for a quaternion of zeros, which is a forbidden combination; and
+    # nothing else is admitted: each free place has exactly its slot's integers, each forced place exactly one token.
     slots = [piece for piece in answer_pieces(arms, style) if isinstance(piece, Slot)]
     assert [allowed[place].sum() for place in np.flatnonzero(forced < 0)] == [s.high - s.low + 1 for s in slots]
     np.testing.assert_array_equal(allowed[forced >= 0].argmax(-1), forced[forced >= 0])
     assert (allowed[forced >= 0].sum(-1) == 1).all()
     rng = np.random.default_rng(0)
     for _ in range(50):
-        tokens = [rng.choice(np.flatnonzero(row)) for row in allowed]
+        tokens = np.array([rng.choice(np.flatnonzero(row)) for row in allowed])
+        assert all((tokens != row)[row >= 0].any() for row in np.asarray(grammar.forbidden))
         parse_answer(tokenizer.decode(tokens), arms, style)
 
 

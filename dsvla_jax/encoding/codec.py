@@ -15,6 +15,7 @@ from dsvla_jax.types import Action, Array
 
 QUATERNION_STEP = 0.01
 VALUES_PER_ARM = 8
+QUATERNION_VALUES = slice(3, 7)  # of them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,16 +78,14 @@ class PoseCodec:
         """int32 (..., 8) -> Action with pose (..., 7) and gripper_open (...,), float32, quaternions of unit length.
 
         Encoding the result gives the same position and gripper; a quaternion integer may differ by one, because
-        rounded quaternions are not quite of unit length. Four zeros, which no pose encodes to, read as no
-        rotation (0, 0, 0, 1), so that every answer of the grammar is a pose.
+        rounded quaternions are not quite of unit length. Four zeros name no rotation and stay four zeros.
         """
         xp = _namespace(integers)
         values: Any = xp.asarray(integers)
         position = values[..., :3].astype(np.float32) * self.step
         rotation = values[..., 3:7].astype(np.float32)
         length = xp.sqrt(xp.sum(rotation * rotation, axis=-1, keepdims=True))
-        identity = np.array([0, 0, 0, 1], np.float32)
-        rotation = xp.where(length > 0, rotation / xp.maximum(length, np.float32(1.0)), identity)
+        rotation = rotation / xp.maximum(length, np.float32(1.0))
         return Action(
             pose=xp.concatenate([position, rotation], axis=-1), gripper_open=values[..., 7].astype(np.float32)
         )

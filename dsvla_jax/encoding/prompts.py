@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from jax.typing import ArrayLike
 
-from dsvla_jax.encoding.codec import VALUES_PER_ARM
+from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
 
 Style = Literal["paper", "compact"]
 STYLES: tuple[Style, ...] = ("paper", "compact")
@@ -122,7 +122,7 @@ def parse_answer(text: str, num_arms: int, style: Style) -> np.ndarray:
     """The answer text -> int32 (A, 8). Spacing and letter case are free; all else must be the grammar's.
 
     Raises:
-        ParseFailure: the text is not an answer, or a number is out of its range.
+        ParseFailure: the text is not an answer, a number is out of its range, or a quaternion is zero.
     """
     pieces = answer_pieces(num_arms, style)
     match = re.fullmatch(_answer_pattern(pieces), text, flags=re.IGNORECASE)
@@ -132,7 +132,10 @@ def parse_answer(text: str, num_arms: int, style: Style) -> np.ndarray:
     for value, slot in zip(values, [piece for piece in pieces if isinstance(piece, Slot)], strict=True):
         if not slot.low <= value <= slot.high:
             raise ParseFailure(f"number {value} is outside {slot.low} to {slot.high} in {text!r}")
-    return np.array(values, np.int32).reshape(num_arms, VALUES_PER_ARM)
+    integers = np.array(values, np.int32).reshape(num_arms, VALUES_PER_ARM)
+    if (integers[:, QUATERNION_VALUES] == 0).all(axis=1).any():
+        raise ParseFailure(f"a quaternion of zeros is no rotation, in {text!r}")
+    return integers
 
 
 def template_texts() -> list[str]:

@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from flax import struct
 
+from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
 from dsvla_jax.encoding.prompts import Slot, Style, answer_pieces, template_texts
 from dsvla_jax.types import Array
 
@@ -144,10 +145,13 @@ class AnswerGrammar:
 
     forced: int32 (L,), the only possible token, or -1 where the policy chooses.
     allowed: bool (L, V), True for the tokens that may stand there (one-hot where forced).
+    forbidden: int32 (A, L), combinations that no answer has: for each arm the tokens of a quaternion of four zeros,
+        which is no rotation; -1 at the other places.
     """
 
     forced: np.ndarray | Array
     allowed: np.ndarray | Array
+    forbidden: np.ndarray | Array
 
 
 def build_answer_grammar(tokenizer: Tokenizer, num_arms: int, style: Style) -> AnswerGrammar:
@@ -178,7 +182,11 @@ def build_answer_grammar(tokenizer: Tokenizer, num_arms: int, style: Style) -> A
     for place, tokens in enumerate(choices):
         allowed[place, tokens] = True
     # NumPy's, not JAX's: the form of an answer must stay concrete when this is called inside a jitted function.
-    return AnswerGrammar(forced=np.asarray(forced, np.int32), allowed=allowed)
+    free = np.flatnonzero(np.asarray(forced) < 0).reshape(num_arms, VALUES_PER_ARM)
+    forbidden = np.full((num_arms, len(forced)), -1, np.int32)
+    for arm, places in enumerate(free):
+        forbidden[arm, places[QUATERNION_VALUES]] = numbers[0]
+    return AnswerGrammar(forced=np.asarray(forced, np.int32), allowed=allowed, forbidden=forbidden)
 
 
 def _single_token(tokenizer: Tokenizer, number: int) -> int:

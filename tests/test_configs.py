@@ -1,0 +1,106 @@
+"""The configs of Table 3's rows: each trains, and each differs from the next in exactly what its row says."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from configs import config_names, get_config
+from data_pipelines.episodes import Frame
+from data_pipelines.samples import make_sampler, suite_tokenizer
+from dsvla_jax.errors import UserError
+from dsvla_jax.geometry.cameras import front_camera
+from dsvla_jax.model.variables import split_variables
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step, model_inputs
+
+# row: (3D spatial constraint, 3D tokens, aligned positional embeddings)
+ROWS = {
+    "tiny_image_only": (False, False, False),
+    "tiny_constraint": (True, False, False),
+    "tiny_index_order": (True, True, False),
+    "tiny": (True, True, True),
+}
+
+
+def frame(arms: int, rng: np.random.Generator) -> Frame:
+    camera = jax.tree.map(np.asarray, front_camera(96))
+    down = np.array([0, 1, 0, 0], np.float32)
+
+    def pose() -> np.ndarray:
+        return np.concatenate([rng.uniform([0, -0.3, 0.8], [0.4, 0.3, 1.2], (arms, 3)), [down] * arms], 1)
+
+    return Frame(
+        rgb=rng.integers(0, 255, (96, 96, 3), np.uint8),
+        depth=rng.uniform(1.0, 1.3, (96, 96)).astype(np.float32),
+        intrinsics=camera.intrinsics,
+        world_from_camera=camera.world_from_camera,
+        pose=pose().astype(np.float32),
+        gripper_open=np.ones(arms, np.float32),
+        keypoint=pose()[:, :3].astype(np.float32),
+        target_pose=pose().astype(np.float32),
+        target_gripper=np.zeros(arms, np.float32),
+        instruction="turn on the light",
+        task="lamp_on",
+        task_index=0,
+        episode=0,
+        frame=0,
+    )
+
+
+def small(name: str) -> Experiment:
+    experiment = get_config(name)
+    model = replace(
+        experiment.model,
+        vision=replace(experiment.model.vision, layers=1),
+        language=replace(experiment.model.language, layers=1),
+        scan_unroll=1,
+    )
+    return replace(experiment, model=model, batch_size=4, steps=8)
+
+
+def batch_of(experiment: Experiment) -> dict[str, np.ndarray]:
+    sample = make_sampler(experiment.data, experiment.encoding, suite_tokenizer())
+    samples = [sample(frame(1 + i % 2, np.random.default_rng(i)), np.random.default_rng(i)) for i in range(4)]
+    return {key: np.stack([one[key] for one in samples]) for key in samples[0]}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_row_trains(name: str):
+    experiment = small(name)
+    batch = batch_of(experiment)
+    values = suite_tokenizer().number_values
+    trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0), values), experiment.regime)
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, values))
+    losses = []
+    for _ in range(experiment.steps):
+        state, metrics = step(state, frozen, batch)
+        losses.append(float(metrics["loss"]))
+    assert np.isfinite(losses).all()
+    assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize(("name", "row"), ROWS.items())
+def test_row_is_what_the_table_says(name: str, row: tuple[bool, bool, bool]):
+    constraint, points, aligned = row
+    experiment = get_config(name)
+    batch = batch_of(experiment)
+    near = suite_tokenizer().encode("near")[0]
+    assert (batch["text_tokens"] == near).any(axis=1).all() == constraint
+    inputs = model_inputs({key: jnp.asarray(value) for key, value in batch.items()}, experiment.encoding)
+    tokens = inputs.point_tokens.shape[1]
+    assert tokens == (experiment.model.vision.num_patches if points else 0)
+    in_order = (np.asarray(inputs.point_patches) == np.arange(tokens)).all()
+    assert in_order != (points and aligned)
+
+
+def test_every_config_loads_and_a_typo_names_the_nearest():
+    for name in config_names():
+        assert isinstance(get_config(name), Experiment)
+    with pytest.raises(UserError, match="unknown config 'tiny_lore': did you mean 'tiny_lora'"):
+        get_config("tiny_lore")
