@@ -109,6 +109,7 @@ class RunCheckpoints:
         return traverse_util.unflatten_dict(variables)
 
     def _require_step(self) -> int:
+        self._manager.wait_until_finished()
         step = self.latest_step
         if step is None:
             raise CheckpointError(

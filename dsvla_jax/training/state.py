@@ -80,7 +80,7 @@ def make_train_step(
         (_, metrics), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
         updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.trainable)
         trainable = cast(Variables, optax.apply_updates(state.trainable, updates))
-        metrics["gradient_norm"] = optax.global_norm(gradients)
+        metrics["gradient_norm"] = optax.tree.norm(gradients)
         return TrainState(state.step + 1, trainable, optimizer_state), metrics
 
     return step
