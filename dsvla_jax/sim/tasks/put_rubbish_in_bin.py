@@ -46,7 +46,8 @@ def _build(spec) -> None:
 
 def _sample(key: Array) -> task.Placement:
     place_key, order_key, turn_key = jax.random.split(key, 3)
-    low, high = jnp.array([0.12, -0.1, -jnp.pi]), jnp.array([0.2, 0.1, jnp.pi])
+    # Turned further, the bin would stand between the front camera and the rubbish.
+    low, high = jnp.array([0.12, -0.1, -2.0]), jnp.array([0.2, 0.1, 2.0])
     x, y, yaw = jax.random.uniform(place_key, (3,), minval=low, maxval=high)
     root = task.upright_pose(x, y, TABLE_HEIGHT, yaw)
     places = jax.random.permutation(order_key, jnp.asarray(PLACES))
