@@ -44,6 +44,11 @@ def main(
     """
     assert run is not None
     prepare_run_folder(run, experiment, resume)
+    checkpoints = RunCheckpoints(run)
+    if checkpoints.latest_step == experiment.steps:
+        checkpoints.close()
+        print(f"{run} has been trained to step {experiment.steps}: nothing to do")
+        return
     data = experiment.data
     generate_demonstrations(
         Path(data.folder),
@@ -65,7 +70,6 @@ def main(
     state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
     report_size(trainable, frozen, reader.num_frames)
 
-    checkpoints = RunCheckpoints(run)
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
         restored = checkpoints.restore(state.trainable, state.optimizer)
