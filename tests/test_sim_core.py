@@ -14,7 +14,7 @@ from dsvla_jax.sim import controller, physics, robot
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.kinematics import forward_kinematics, inverse_kinematics
 from dsvla_jax.sim.tasks import Graspable, Placement, Task
-from dsvla_jax.sim.tasks.task import BOX, add_object, add_part, upright_pose
+from dsvla_jax.sim.tasks.task import BOX, SPHERE, add_object, add_part, upright_pose
 from dsvla_jax.types import TABLE_HEIGHT, Action
 
 HALF = 0.0225
@@ -24,12 +24,12 @@ BATCH = 4  # the same everywhere, as each batch size is compiled anew
 _forward = jax.jit(jax.vmap(forward_kinematics, in_axes=(0, None)))
 
 
-def _cube_task(num_arms: int) -> Task:
-    """A cube on the table; success is holding it 10 cm up."""
+def _cube_task(num_arms: int, shape=BOX) -> Task:
+    """A cube (or a ball in its place) on the table; success is holding it 10 cm up."""
 
     def build(spec):
         cube = add_object(spec, "cube", HALF)
-        add_part(cube, "cube", BOX, [HALF] * 3, [0, 0, 0], [0.8, 0.1, 0.1, 1], robot.OBJECT, mass=0.1)
+        add_part(cube, "cube", shape, [HALF] * 3, [0, 0, 0], [0.8, 0.1, 0.1, 1], robot.OBJECT, mass=0.1)
 
     def sample(key):
         xy = jax.random.uniform(key, (2,), minval=jnp.array([0.05, -0.15]), maxval=jnp.array([0.25, 0.15]))
@@ -53,8 +53,8 @@ def _cube_task(num_arms: int) -> Task:
 
 
 @functools.cache
-def _environment(num_arms: int = 1, backend: Literal["mujoco", "mjx"] = "mujoco") -> Environment:
-    return Environment(_cube_task(num_arms), backend, image_size=32)
+def _environment(num_arms: int = 1, backend: Literal["mujoco", "mjx"] = "mujoco", shape=BOX) -> Environment:
+    return Environment(_cube_task(num_arms, shape), backend, image_size=32)
 
 
 def _cube(env: Environment, state) -> np.ndarray:
@@ -314,7 +314,8 @@ def test_both_steppers_agree_and_keep_episodes_apart():
 
 @pytest.mark.slow
 def test_mjx_grasps_and_carries_as_mujoco_does():
-    env, oracle = _environment(backend="mjx"), _environment()
+    # A ball: contacts between boxes take minutes to compile.
+    env, oracle = _environment(backend="mjx", shape=SPHERE), _environment(shape=SPHERE)
     state = env.reset(_keys())
     expected = oracle.reset(_keys())
     np.testing.assert_allclose(state.qpos, expected.qpos, atol=1e-3)
