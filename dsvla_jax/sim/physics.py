@@ -12,6 +12,7 @@ state.
 """
 
 import copy
+import functools
 import os
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -24,6 +25,8 @@ import numpy as np
 from flax import struct
 
 from dsvla_jax.types import Array
+
+CPU_BATCH = 5  # episodes that MJX steps side by side on a CPU
 
 
 class SimState(struct.PyTreeNode):
@@ -209,7 +212,11 @@ class MjxStepper:
             eq_active = jnp.broadcast_to(
                 jnp.asarray(state.eq_active)[:, None], (controls.shape[0], steps, state.eq_active.shape[-1])
             )
-        return jax.vmap(lambda s, c, e: self._run_one(model, s, c, e, success_fn))(state, controls, eq_active)
+        # XLA compiles MJX for a CPU the longer the wider the batch, and gains nothing there from a wide one.
+        batch = controls.shape[0]
+        chunk = _widest_divisor(batch, CPU_BATCH) if jax.default_backend() == "cpu" else batch
+        run = functools.partial(self._run_one, model, success_fn=success_fn)
+        return jax.lax.map(lambda arguments: run(*arguments), (state, controls, eq_active), batch_size=chunk)
 
     def _run_one(
         self, model: Any, state: SimState, controls: Array, eq_active: Array, success_fn: SuccessFn | None
@@ -254,6 +261,11 @@ class MjxStepper:
             mocap_pos=jnp.asarray(state.mocap_pos),
             mocap_quat=jnp.asarray(state.mocap_quat),
         )
+
+
+def _widest_divisor(number: int, limit: int) -> int:
+    """The largest divisor of ``number`` that is at most ``limit``, so that no chunk is left over."""
+    return max(divisor for divisor in range(1, min(number, limit) + 1) if number % divisor == 0)
 
 
 def mjx_stepper(model: mujoco.MjModel) -> MjxStepper:
