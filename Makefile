@@ -46,4 +46,4 @@ format: setup  ## format the code
 	$(PY) -m ruff check --fix .
 
 lock: setup  ## resolve requirements.lock again
-	$(VENV)/bin/uv pip compile --universal --generate-hashes --no-emit-index-url --no-header -q pyproject.toml -o requirements.lock
+	$(VENV)/bin/uv pip compile --universal --generate-hashes --no-header -q pyproject.toml -o requirements.lock

@@ -7,23 +7,20 @@ import subprocess
 import sys
 from pathlib import Path
 
-from dsvla_jax.report import read_results
+from dsvla_jax.report import compare_physics, read_results
 
 
 def main(run: Path) -> int:
-    outcomes = {}
+    sets = []
     for physics in ("mujoco", "mjx"):
         subprocess.run([sys.executable, "eval.py", str(run), "--physics", physics, "--skip-finished"], check=True)
-        results = read_results(run / "eval" / f"{physics}.jsonl")
-        outcomes[physics] = {(result.task, result.seed): result.success for result in results}
-    pairs = sorted(outcomes["mujoco"].keys() & outcomes["mjx"].keys())
-    agreement = {}
-    for task in sorted({task for task, _ in pairs}):
-        mine = [outcomes["mujoco"][pair] == outcomes["mjx"][pair] for pair in pairs if pair[0] == task]
-        agreement[task] = sum(mine) / len(mine)
-        print(f"{task:24} {sum(mine)} of {len(mine)} agree")
-    total = sum(outcomes["mujoco"][pair] == outcomes["mjx"][pair] for pair in pairs) / len(pairs)
-    print(f"agreement {total:.3f} over {len(pairs)} episodes (at least 0.90)")
+        sets.append(read_results(run / "eval" / f"{physics}.jsonl"))
+    tasks = compare_physics(*sets).tasks
+    for name, one, _, only_first, only_second in tasks:
+        print(f"{name:24} {one.trials - only_first - only_second} of {one.trials} agree")
+    episodes = sum(one.trials for _, one, *_ in tasks)
+    total = 1 - sum(only_first + only_second for *_, only_first, only_second in tasks) / episodes
+    print(f"agreement {total:.3f} over {episodes} episodes (at least 0.90)")
     return int(total < 0.90)
 
 

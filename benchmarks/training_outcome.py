@@ -6,19 +6,15 @@ Usage: python -m benchmarks.training_outcome [RUN]
 import sys
 from pathlib import Path
 
-from dsvla_jax.report import print_table, read_results
+from dsvla_jax.report import macro_mean, print_table, read_results, success_rates
 
 
 def main(run: Path) -> int:
     results = read_results(run / "eval" / "mujoco.jsonl")
     print_table(results)
-    tasks = sorted({result.task for result in results})
-    rates, short = {}, False
-    for task in tasks:
-        outcomes = [result.success for result in results if result.task == task]
-        rates[task] = sum(outcomes) / len(outcomes)
-        short |= len(outcomes) < 25
-    mean, lowest = sum(rates.values()) / len(rates), min(rates.values())
+    rates = success_rates(results)
+    mean, lowest = macro_mean(rates), min(rate.rate for rate in rates)
+    short = any(rate.trials < 25 for rate in rates)
     print(f"mean {mean:.3f} (at least 0.80), lowest {lowest:.3f} (at least 0.60), {len(results)} episodes")
     return int(mean < 0.80 or lowest < 0.60 or short)
 
