@@ -32,17 +32,8 @@ from dsvla_jax.training.sharding import batch_sharding, replicate
 from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
 
 
-def main(
-    experiment: Annotated[Experiment, tyro.conf.arg(name="")], run: Path | None = None, resume: bool = False
-) -> None:
-    """Trains one experiment.
-
-    Args:
-        experiment: what to train; every field of the config can be overridden.
-        run: the run folder; runs/CONFIG if not given.
-        resume: go on from the newest checkpoint of the run folder; a finished run is left as it is.
-    """
-    assert run is not None
+def main(experiment: Experiment, run: Path, resume: bool) -> None:
+    """Trains one experiment into the run folder, or goes on from its newest checkpoint."""
     prepare_run_folder(run, experiment, resume)
     checkpoints = RunCheckpoints(run)
     if checkpoints.latest_step == experiment.steps:
@@ -169,15 +160,21 @@ def command_line(arguments: list[str]) -> None:
     experiment = get_config(name)
     configure_jax()
 
-    def run_it(
+    def train(
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = experiment,
         run: Path = Path("runs") / name,
         resume: bool = False,
     ) -> None:
+        """Trains one experiment.
+
+        Args:
+            experiment: what to train; every field of the config can be overridden.
+            run: the run folder.
+            resume: go on from the newest checkpoint of the run folder; a finished run is left as it is.
+        """
         main(experiment, run, resume)
 
-    run_it.__doc__ = main.__doc__
-    tyro.cli(run_it, args=rest, prog=f"train.py {name}")
+    tyro.cli(train, args=rest, prog=f"train.py {name}")
 
 
 if __name__ == "__main__":

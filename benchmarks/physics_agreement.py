@@ -1,4 +1,4 @@
-"""The policy of `make train` in MJX and in C MuJoCo: at least 90 % of outcomes agree (about 25 minutes).
+"""The policy of `make train` in MJX and in C MuJoCo: at least 90 % of outcomes agree (about 8 minutes).
 
 Usage: python -m benchmarks.physics_agreement [RUN]. Evaluates what has not been evaluated yet.
 """

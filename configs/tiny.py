@@ -4,10 +4,11 @@ What differs from the paper profile, and why, is in docs/architecture.md under "
 """
 
 from data_pipelines.samples import suite_tokenizer
+from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
-from dsvla_jax.training.experiment import DataConfig, Experiment, OptimizerConfig
+from dsvla_jax.training.experiment import Experiment, OptimizerConfig
 
 WIDTH = 128
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from data_pipelines.augment import jitter_state, perturb_keypoint, random_offset, shift_world, vary_colour
 from data_pipelines.episodes import Frame
+from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
 from dsvla_jax.encoding.prompts import Style, format_answer
 from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar, vocabulary
 from dsvla_jax.sim.tasks import TASKS
-from dsvla_jax.training.experiment import DataConfig
 
 Sample = dict[str, np.ndarray]
 

@@ -242,7 +242,7 @@ def test_actions_of_a_wrong_shape_are_named():
 
 @functools.cache
 def _tiny_model() -> mujoco.MjModel:
-    """A ball on a plane, a ball welded to a mocap body, a slide with an actuator."""
+    """A ball on a plane, a ball welded to a mocap body from which a pendulum hangs, a slide with an actuator."""
     spec = mujoco.MjSpec()
     robot.set_physics_options(spec)
     plane = mujoco.mjtGeom.mjGEOM_PLANE
@@ -252,7 +252,10 @@ def _tiny_model() -> mujoco.MjModel:
         body = spec.worldbody.add_body(name=name, pos=[x, 0, 0.06])
         body.add_freejoint()
         body.add_geom(type=ball, size=[0.05, 0, 0], mass=0.1, contype=2, conaffinity=1)
-    spec.worldbody.add_body(name="hand", mocap=True, pos=[0.5, 0, 0.3])
+    hand = spec.worldbody.add_body(name="hand", mocap=True, pos=[0.5, 0, 0.3])
+    pendulum = hand.add_body(pos=[0, 0, 0.1])
+    pendulum.add_joint(name="pendulum", axis=[0, 1, 0], damping=0.01)
+    pendulum.add_geom(type=ball, pos=[0.1, 0, 0], size=[0.02, 0, 0], mass=0.1, contype=0, conaffinity=0)
     slider = spec.worldbody.add_body(pos=[0, 0.5, 0.3])
     slider.add_joint(name="slide", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0], damping=0.5)
     slider.add_geom(type=ball, size=[0.05, 0, 0], mass=1.0, contype=0, conaffinity=0)
@@ -295,7 +298,7 @@ def _tiny_run(stepper: physics.Stepper) -> physics.SimState:
 def test_both_steppers_agree_and_keep_episodes_apart():
     c_state = _tiny_run(physics.mujoco_stepper(_tiny_model()))
     mjx_stepper = physics.mjx_stepper(_tiny_model())
-    mjx_state = _tiny_run(jax.jit(mjx_stepper, static_argnums=2))
+    mjx_state = _tiny_run(physics.jit_with_mjx(mjx_stepper, static_argnums=2))
     good = np.array([0, 2, 3])
     for state in (c_state, mjx_state):
         np.testing.assert_array_equal(state.diverged, [False, True, False, False])

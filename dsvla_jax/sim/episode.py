@@ -63,7 +63,7 @@ class Environment:
             self._execute = self._execute_on(plan, stepper, attach)
         elif physics == "mjx":
             stepper = physics_module.mjx_stepper(self.scene.mj_model)
-            jitted = jax.jit(self._execute_mjx(stepper))
+            jitted = physics_module.jit_with_mjx(self._execute_mjx(stepper))
             self._execute = lambda state, action: jitted(stepper.mjx_model, state, action)
         else:
             raise ValueError(f"physics: expected 'mujoco' or 'mjx', got {physics!r}")

@@ -26,8 +26,6 @@ from flax import struct
 
 from dsvla_jax.types import Array
 
-CPU_BATCH = 5  # episodes that MJX steps side by side on a CPU
-
 
 class SimState(struct.PyTreeNode):
     """The whole state of B episodes. Quaternions inside qpos and mocap_quat are wxyz, MuJoCo's order.
@@ -188,15 +186,18 @@ def mujoco_stepper(model: mujoco.MjModel, threads: int | None = None) -> MujocoS
 
 
 class MjxStepper:
-    """MJX: pure and jittable. ``mjx_model`` may be passed in as an argument of the enclosing jit, so that the model is
-    not baked into the program as constants."""
+    """MJX: pure, for use under ``jit_with_mjx``. ``mjx_model`` may be passed in as an argument of the enclosing jit, so
+    that the model is not baked into the program as constants."""
 
     def __init__(self, model: mujoco.MjModel):
         from mujoco import mjx
 
         self._mjx = mjx
-        self.mjx_model = mjx.put_model(model, impl="jax")
-        self._template = mjx.make_data(model, impl="jax")
+        # MJX commits its arrays to a device; jit would compile again whenever they meet others that are not.
+        self.mjx_model = _uncommitted(mjx.put_model(model, impl="jax"))
+        self._template = _uncommitted(mjx.make_data(model, impl="jax"))
+        self._mocap_bodies = np.flatnonzero(model.body_mocapid >= 0)
+        self._mocap_ids = model.body_mocapid[self._mocap_bodies]
 
     def __call__(
         self,
@@ -212,16 +213,13 @@ class MjxStepper:
             eq_active = jnp.broadcast_to(
                 jnp.asarray(state.eq_active)[:, None], (controls.shape[0], steps, state.eq_active.shape[-1])
             )
-        # XLA compiles MJX for a CPU the longer the wider the batch, and gains nothing there from a wide one.
-        batch = controls.shape[0]
-        chunk = _widest_divisor(batch, CPU_BATCH) if jax.default_backend() == "cpu" else batch
         run = functools.partial(self._run_one, model, success_fn=success_fn)
-        return jax.lax.map(lambda arguments: run(*arguments), (state, controls, eq_active), batch_size=chunk)
+        return jax.vmap(run)(state, controls, eq_active)
 
     def _run_one(
         self, model: Any, state: SimState, controls: Array, eq_active: Array, success_fn: SuccessFn | None
     ) -> SimState:
-        model = model.replace(eq_data=state.eq_data)
+        model = self._with_state(model, state)
         active_dtype = self._template.eq_active.dtype
         data = self._data(state)
 
@@ -248,7 +246,16 @@ class MjxStepper:
 
     def update_geometry(self, state: SimState) -> SimState:
         """Sets geom_xpos and geom_xmat from qpos and the mocap poses."""
-        return jax.vmap(lambda s: self._with_geometry(self.mjx_model, s))(state)
+        return jax.vmap(lambda s: self._with_geometry(self._with_state(self.mjx_model, s), s))(state)
+
+    def _with_state(self, model: Any, state: SimState) -> Any:
+        """The model of one episode: its welds, and its furniture where the mocap poses are. MJX moves a mocap body
+        without the bodies that hang from it; those follow the model's own pose of the body."""
+        return model.replace(
+            eq_data=state.eq_data,
+            body_pos=model.body_pos.at[self._mocap_bodies].set(state.mocap_pos[self._mocap_ids]),
+            body_quat=model.body_quat.at[self._mocap_bodies].set(state.mocap_quat[self._mocap_ids]),
+        )
 
     def _with_geometry(self, model: Any, state: SimState) -> SimState:
         data = self._mjx.kinematics(model, self._data(state))
@@ -263,9 +270,18 @@ class MjxStepper:
         )
 
 
-def _widest_divisor(number: int, limit: int) -> int:
-    """The largest divisor of ``number`` that is at most ``limit``, so that no chunk is left over."""
-    return max(divisor for divisor in range(1, min(number, limit) + 1) if number % divisor == 0)
+def _uncommitted(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)
+
+
+def jit_with_mjx(function: Callable[..., Any], **options: Any) -> Any:
+    """``jax.jit`` for programs with MJX in them.
+
+    XLA's CPU fusion emitters of jax 0.10 recompute a chain of bodies from its root for every link: exponentially in
+    the number of joints, seconds a step for an arm. They are switched off where that compiler is the one in use.
+    """
+    affected = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
+    return jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": False} if affected else None, **options)
 
 
 def mjx_stepper(model: mujoco.MjModel) -> MjxStepper:

@@ -7,33 +7,10 @@ from typing import Literal
 
 import cattrs
 
+from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
-
-
-@dataclasses.dataclass(frozen=True)
-class DataConfig:
-    """Scripted-expert demonstrations and what is varied each time a sample is drawn from them."""
-
-    folder: str = "data/demos"
-    tasks: tuple[str, ...] = ("lamp_on", "put_rubbish_in_bin", "close_fridge", "bimanual_lift_ball")
-    episodes: int = 100
-    """Demonstrations a task."""
-    image_size: int = 96
-    """Rendered pixels a side."""
-    seed: int = 0
-    perturb: float = 0.03
-    """Metres by which half of the key poses are missed on purpose, so that the next sample starts off the path."""
-    shift_world: float = 0.0
-    """Metres: pose, keypoints, target and camera are moved by one random offset, so the picture stays true."""
-    state_jitter: float = 0.0
-    """Metres of noise on the stated current position, on half of the samples."""
-    keypoint_noise: float = 0.03
-    """Metres of uniform noise an axis on the keypoint (paper, section 3.3; the paper leaves its size open)."""
-    keypoint_noise_probability: float = 0.5
-    colour_variation: float = 0.0
-    """Relative strength of the brightness, contrast and colour variation; 0 turns it off."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +40,7 @@ class Experiment:
 
     encoding: EncodingConfig
     model: ModelConfig
-    data: DataConfig = DataConfig()
+    data: DataConfig = dataclasses.field(default_factory=DataConfig)
     optimizer: OptimizerConfig = OptimizerConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     regime: Literal["full", "lora"] = "full"
