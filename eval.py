@@ -94,11 +94,11 @@ def evaluate_task(
     task = get_task(name)
     environment = Environment(task, physics=options.physics, image_size=experiment.data.image_size)
     keys = episode_keys(options.seed, "eval", name, 0, episodes)
-    instructions = [task.instructions[i % len(task.instructions)] for i in range(episodes)]
     limit = experiment.evaluation.max_keyframes
     with tqdm(total=limit, desc=f"{name} x {episodes} ({options.physics})", unit="keyframe") as bar:
         bar.set_postfix_str("resetting; the first use compiles")
         state = environment.reset(keys)
+        instructions = environment.instructions(state, np.arange(episodes))
         keypoints = np.asarray(environment.keypoints(state))
         noise = np.random.default_rng(options.seed).uniform(-1, 1, keypoints.shape) * options.keypoint_noise
         keypoints = (keypoints + noise).astype(np.float32)

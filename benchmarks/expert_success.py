@@ -1,46 +1,85 @@
-"""Scripted experts on fresh seeds: at least 98 of 100 a task; no success at reset or after doing nothing (2 minutes).
+"""Scripted experts: >= 98 of 100 fresh seeds a task; no success at reset, idle, or by a wrong variation (8 minutes).
 
-Usage: python -m benchmarks.expert_success [EPISODES]
+Usage: python -m benchmarks.expert_success [--tasks lamp_on ...] [--episodes 100] [--film FOLDER]
+
+--film writes a picture a task: the first four episodes, a row each, at reset and after every key pose.
 """
 
+import dataclasses
 import sys
+from pathlib import Path
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
-from dsvla_jax.command_line import configure_jax
+from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import TASKS
+from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.types import Action
 
 
-def run_expert(environment: Environment, keys: jax.Array) -> dict[str, np.ndarray]:
-    """Which episodes succeed: by the expert, at reset, and after the arms have been told to stay where they are."""
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which experts, and on how many seeds."""
+
+    tasks: tuple[str, ...] = ("all",)
+    episodes: int = 100
+    film: Path | None = None
+
+
+def follow(environment: Environment, state: SimState, plan: Action) -> list[SimState]:
+    """The states at the start and after each key pose of a plan (B, M, A, ...)."""
+    states = [state]
+    for m in range(plan.pose.shape[1]):
+        states.append(environment.execute(states[-1], Action(plan.pose[:, m], plan.gripper_open[:, m])))
+    return states
+
+
+def run_expert(environment: Environment, keys: jax.Array, film: Path | None = None) -> dict[str, np.ndarray]:
+    """Which episodes succeed: by the expert, at reset, after the arms have been told to stay, and, where the task has
+    variations, by the expert of another one."""
     start = environment.reset(keys)
     pose, gripper = environment.end_effector(start)
-    idle = start
-    for _ in range(3):
-        idle = environment.execute(idle, Action(pose, gripper))
-    plan, state = environment.expert(start), start
-    for m in range(plan.pose.shape[1]):
-        state = environment.execute(state, Action(plan.pose[:, m], plan.gripper_open[:, m]))
-    reached = {"expert": state, "at reset": start, "idle": idle}
-    return {name: np.asarray(jnp.asarray(environment.success(end))) for name, end in reached.items()}
+    stay = Action(jnp.repeat(pose[:, None], 3, 1), jnp.repeat(gripper[:, None], 3, 1))
+    states = follow(environment, start, environment.expert(start))
+    ends = {"expert": states[-1], "at reset": start, "idle": follow(environment, start, stay)[-1]}
+    count = environment.task.variations
+    if count > 1:
+        other = start.replace(variation=(start.variation + 1 + jnp.arange(len(keys)) % (count - 1)) % count)
+        ends["wrong variation"] = follow(environment, start, environment.expert(other))[-1]
+    if film:
+        film.mkdir(parents=True, exist_ok=True)
+        pictures = np.stack([np.asarray(environment.observe(s).rgb)[:4] for s in states], axis=1)
+        rows = [np.concatenate(list(row), axis=1) for row in pictures]
+        cv2.imwrite(str(film / f"{environment.task.name}.png"), np.concatenate(rows)[..., ::-1])
+    return {name: np.asarray(environment.success(end)) for name, end in ends.items()}
 
 
-def main(episodes: int) -> int:
+def main(options: Options) -> int:
     configure_jax()
     short = False
-    for name in TASKS:
+    for name in select_tasks(options.tasks):
         # The validation stream: neither demonstrations nor evaluations use it.
-        outcome = run_expert(Environment(name), episode_keys(0, "validation", name, 0, episodes))
+        environment = Environment(name, image_size=224 if options.film else 96)
+        outcome = run_expert(environment, episode_keys(0, "validation", name, 0, options.episodes), options.film)
         counts = {key: int(value.sum()) for key, value in outcome.items()}
-        short |= counts["expert"] < 0.98 * episodes or counts["at reset"] > 0 or counts["idle"] > 0
-        print(f"{name:24}" + "".join(f"  {key} {count}/{episodes}" for key, count in counts.items()), flush=True)
+        wrong = sum(count for key, count in counts.items() if key != "expert")
+        short |= counts["expert"] < 0.98 * options.episodes or wrong > 0
+        failures = np.flatnonzero(~outcome["expert"])
+        print(
+            f"{name:36}"
+            + "".join(f"  {key} {count}/{options.episodes}" for key, count in counts.items())
+            + (f"  failed seeds {failures[:10].tolist()}" if len(failures) else ""),
+            flush=True,
+        )
     return int(short)
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else 100))
+    with fail_with_message():
+        sys.exit(main(tyro.cli(Options, description=__doc__)))

@@ -161,7 +161,7 @@ def task_scenes(names: list[str]) -> Iterator[tuple[str, mujoco.MjModel, mujoco.
 
     for name in names or sorted(TASKS):
         scene = build_scene(get_task(name))
-        model, state = scene.mj_model, scene.place(scene.task.sample(jax.random.key(0)))
+        model, state = scene.mj_model, scene.place(scene.task.sample(jax.random.key(0), jnp.int32(0)))
         data = mujoco.MjData(model)
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = state.qpos, state.mocap_pos, state.mocap_quat
         model.geom_rgba[:] = state.geom_rgba

@@ -81,6 +81,8 @@ class ScriptedExpert:
         generators = [
             np.random.default_rng([settings.seed, zlib.crc32(self.task.name.encode()), start + i]) for i in range(count)
         ]
+        ways = [generator.integers(len(self.task.instructions)) for generator in generators]
+        instructions = environment.instructions(state, np.array(ways))
         missed = poses.copy()
         missed[..., :3] += np.stack([self._misses(rng, poses.shape[1]) for rng in generators])
 
@@ -106,7 +108,7 @@ class ScriptedExpert:
             episodes.append(
                 make_episode(
                     task=self.task.name,
-                    instruction=self.task.instructions[generators[i].integers(len(self.task.instructions))],
+                    instruction=instructions[i],
                     seed=start + i,
                     rgb=[x.rgb for x in seen],
                     depth=[mark_missing(x.depth) for x in seen],

@@ -27,7 +27,7 @@ Sample = dict[str, np.ndarray]
 @cache
 def suite_tokenizer() -> WordTokenizer:
     """The word-level vocabulary of every instruction of the task suite."""
-    return WordTokenizer(vocabulary(text for task in TASKS.values() for text in task.instructions))
+    return WordTokenizer(vocabulary(text for task in TASKS.values() for text in task.all_instructions()))
 
 
 def make_sampler(

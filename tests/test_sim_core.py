@@ -31,7 +31,7 @@ def _cube_task(num_arms: int, shape=BOX) -> Task:
         cube = add_object(spec, "cube", HALF)
         add_part(cube, "cube", shape, [HALF] * 3, [0, 0, 0], [0.8, 0.1, 0.1, 1], robot.OBJECT, mass=0.1)
 
-    def sample(key):
+    def sample(key, variation):
         xy = jax.random.uniform(key, (2,), minval=jnp.array([0.05, -0.15]), maxval=jnp.array([0.25, 0.15]))
         # A little above the table, so that it has to settle.
         return Placement(free={"cube": upright_pose(xy[0], xy[1], TABLE_HEIGHT + HALF + 0.005)})
@@ -167,7 +167,7 @@ def test_reset_is_seeded_settled_and_observable():
     again = env.reset(_keys()[::-1])
     np.testing.assert_array_equal(again.qpos, np.asarray(state.qpos)[::-1])
     assert np.ptp(_cube(env, state)[:, 0]) > 0.01
-    assert not np.any(state.succeeded)
+    assert not np.any(state.verdict.succeeded)
     assert not np.any(state.ik_failed)
     observation = env.observe(state)
     assert observation.rgb.shape == (BATCH, 32, 32, 3)
@@ -196,7 +196,7 @@ def test_a_cube_is_attached_carried_and_released():
     weld = env.scene.graspables[0].welds[0]
     held, carried, goal = _carry(env, state)
     assert np.asarray(held.eq_active)[:, weld].all()
-    assert not np.any(held.succeeded)
+    assert not np.any(held.verdict.succeeded)
     np.testing.assert_allclose(_cube(env, carried)[:, :3], goal[:, 0], atol=0.006)
     np.testing.assert_array_equal(env.success(carried), True)
 
@@ -289,10 +289,13 @@ def _tiny_run(stepper: physics.Stepper) -> physics.SimState:
     steps = 120
     controls = np.broadcast_to(np.linspace(0, 1, steps, dtype=np.float32)[None, :, None], (4, steps, 1))
     active = np.broadcast_to((np.arange(steps) >= 60)[None, :, None], (4, steps, 1))
-    # Holds only while the ball falls, at no end of the run.
-    return stepper(
-        state, jnp.asarray(controls), lambda s: (s.qpos[2] < 0.0575) & (s.qpos[0] < 0.05), jnp.asarray(active)
-    )
+    return stepper(state, jnp.asarray(controls), _passing_low, jnp.asarray(active))
+
+
+def _passing_low(state: physics.SimState) -> physics.Verdict:
+    """Holds only while the ball falls, at no end of the run."""
+    low = (state.qpos[2] < 0.0575) & (state.qpos[0] < 0.05)
+    return state.verdict.replace(succeeded=state.verdict.succeeded | low)
 
 
 def test_both_steppers_agree_and_keep_episodes_apart():
@@ -302,7 +305,7 @@ def test_both_steppers_agree_and_keep_episodes_apart():
     good = np.array([0, 2, 3])
     for state in (c_state, mjx_state):
         np.testing.assert_array_equal(state.diverged, [False, True, False, False])
-        np.testing.assert_array_equal(state.succeeded, [True, False, True, True])
+        np.testing.assert_array_equal(state.verdict.succeeded, [True, False, True, True])
         np.testing.assert_allclose(np.asarray(state.qpos)[1], np.asarray(_tiny_model().qpos0), atol=1e-6)
         # The welded balls have come to their own offsets from their own hands.
         held = np.asarray(state.qpos)[good, 7:10]

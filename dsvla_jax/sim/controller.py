@@ -155,6 +155,7 @@ def attach(
     closing: Array,
     body_poses: Array,
     half_extents: np.ndarray,
+    centres: np.ndarray,
     welds: np.ndarray,
 ) -> tuple[Array, Array]:
     """Welds to each hand that has just closed the graspable whose box is at the tool centre point, the closest if more.
@@ -162,20 +163,21 @@ def attach(
     Args:
         eq_active: bool (neq,). eq_data: float32 (neq, mjNEQDATA).
         tool_poses: float32 (A, 7). closing: bool (A,).
-        body_poses: float32 (N, 7) and half_extents: (N, 3), the graspables' boxes. welds: int (A, N).
+        body_poses: float32 (N, 7). half_extents, centres: (N, 3), the graspables' boxes in their bodies' frames.
+        welds: int (A, N).
     Returns:
         the new eq_active and eq_data.
     """
     if not welds.size:
         return eq_active, eq_data
 
-    def outside(tool: Array, body: Array, half: Array) -> Array:
+    def outside(tool: Array, body: Array, half: Array, centre: Array) -> Array:
         local = quaternion_rotate(quaternion_conjugate(body[3:]), tool[:3] - body[:3])
-        return jnp.max(jnp.abs(local) - half)
+        return jnp.max(jnp.abs(local - centre) - half)
 
     for i in range(welds.shape[0]):
-        distances = jax.vmap(outside, in_axes=(None, 0, 0))(
-            tool_poses[i], body_poses, jnp.asarray(half_extents, jnp.float32)
+        distances = jax.vmap(outside, in_axes=(None, 0, 0, 0))(
+            tool_poses[i], body_poses, jnp.asarray(half_extents, jnp.float32), jnp.asarray(centres, jnp.float32)
         )
         grasped = closing[i] & (distances < GRASP_MARGIN) & (jnp.arange(len(half_extents)) == jnp.argmin(distances))
         hand = hand_pose(tool_poses[i])

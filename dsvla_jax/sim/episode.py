@@ -11,13 +11,19 @@ import numpy as np
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.sim import controller, raycast
 from dsvla_jax.sim import physics as physics_module
-from dsvla_jax.sim.physics import SimState
+from dsvla_jax.sim.physics import SimState, Verdict
 from dsvla_jax.sim.scene import build_scene
 from dsvla_jax.sim.tasks import StateView, Task, get_task
 from dsvla_jax.types import Action, Array, Observation
 
 # A pose that no arm reaches: an action that cannot be planned leaves the arms still.
 _OUT_OF_REACH = np.array([0.0, 0.0, 100.0, 0.0, 1.0, 0.0, 0.0], np.float32)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _draw_variations(keys: Array, count: int) -> Array:
+    # A stream of its own, so that a task's placement does not depend on how many variations it has.
+    return jax.vmap(lambda key: jax.random.randint(jax.random.fold_in(key, 1), (), 0, count))(keys)
 
 
 class Environment:
@@ -48,11 +54,12 @@ class Environment:
         self._primitives = raycast.primitives_from_model(self.scene.mj_model)
         self._arms = self.scene.arms
         graspables = self.scene.graspables
-        self._welds = np.array([g.welds for g in graspables], np.int32).reshape(len(graspables), self.num_arms).T
-        self._half_extents = np.array([g.half_extents for g in graspables], np.float32).reshape(len(graspables), 3)
-        self._success_fn = self._holds  # one object, as it is a key of compiled programs
+        self._welds = self.scene.welds
+        self._half_extents = np.array([g.half_extents for g in graspables], np.float32).reshape(-1, 3)
+        self._centres = np.array([g.centre for g in graspables], np.float32).reshape(-1, 3)
+        self._judge = self._judge_one  # one object, as it is a key of compiled programs
 
-        self._place = jax.jit(jax.vmap(lambda key: self.scene.place(self.task.sample(key))))
+        self._place = jax.jit(jax.vmap(lambda key, variation: self.scene.place(self.task.sample(key, variation))))
         self._render = jax.jit(jax.vmap(self._render_one))
         self._end_effector = jax.jit(jax.vmap(lambda qpos: controller.end_effector(qpos, self._arms)))
         self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
@@ -70,25 +77,35 @@ class Environment:
 
     def view(self, state: SimState) -> StateView:
         """What the task's functions read, of one example."""
-        return self.scene.view(state.qpos, state.mocap_pos, state.mocap_quat)
+        return self.scene.view(state)
 
-    def reset(self, keys: Array) -> SimState:
-        """PRNG keys (B,) -> the B episodes' start: bodies placed and at rest, arms at the start posture."""
+    def reset(self, keys: Array, variation: Array | None = None) -> SimState:
+        """PRNG keys (B,) -> the B episodes' start: bodies placed and at rest, arms at the start posture.
+
+        variation: int32 (B,), drawn from the keys if not given.
+        """
         batch = len(keys)
-        placed = self._place(keys)
+        if variation is None:
+            variation = self.variations(keys)
+        placed = self._place(keys, jnp.asarray(variation, jnp.int32))
         state = physics_module.initial_state(self.scene.mj_model, batch).replace(
             qpos=placed.qpos,
             ctrl=placed.ctrl,
             mocap_pos=placed.mocap_pos,
             mocap_quat=placed.mocap_quat,
             geom_rgba=placed.geom_rgba,
+            variation=jnp.asarray(variation, jnp.int32),
         )
         hold = Action(
             pose=jnp.broadcast_to(_OUT_OF_REACH, (batch, self.num_arms, 7)),
             gripper_open=jnp.ones((batch, self.num_arms), jnp.float32),
         )
         settled = self.execute(state, hold)
-        return settled.replace(succeeded=state.succeeded, ik_failed=state.ik_failed)
+        return settled.replace(verdict=state.verdict, ik_failed=state.ik_failed)
+
+    def variations(self, keys: Array) -> Array:
+        """The variations int32 (B,) that ``reset`` draws from PRNG keys (B,)."""
+        return _draw_variations(keys, self.task.variations)
 
     def execute(self, state: SimState, action: Action) -> SimState:
         """Moves to a key pose, then opens or closes the grippers. action: pose (B, A, 7), gripper_open (B, A).
@@ -115,8 +132,16 @@ class Environment:
         return self._render(state.geom_xpos, state.geom_xmat, state.geom_rgba)
 
     def success(self, state: SimState) -> Array:
-        """bool (B,): the task's predicate has held at some physics step since reset."""
-        return jnp.asarray(state.succeeded)
+        """bool (B,): the task's predicate has held at some physics step since reset, and no failure came before."""
+        return jnp.asarray(state.verdict.succeeded)
+
+    def instructions(self, state: SimState, way: int | np.ndarray = 0) -> list[str]:
+        """B sentences, in one of the ways that the task can be said; way: one for all or (B,)."""
+        variations = np.asarray(state.variation)
+        return [
+            self.task.say(int(v), int(w))
+            for v, w in zip(variations, np.broadcast_to(way, len(variations)), strict=True)
+        ]
 
     def keypoints(self, state: SimState) -> Array:
         """float32 (B, A, K, 3), the task's keypoints as the objects are now."""
@@ -130,8 +155,17 @@ class Environment:
         """pose float32 (B, A, 7), gripper_open float32 (B, A)."""
         return self._end_effector(state.qpos)
 
-    def _holds(self, state: SimState) -> Array:
-        return self.task.success(self.view(state))
+    def _judge_one(self, state: SimState) -> Verdict:
+        """The stages are passed one a step at most; success counts after the last of them."""
+        view, verdict = self.view(state), state.verdict
+        open_ = ~(verdict.succeeded | verdict.failed)
+        failed = verdict.failed | (open_ & self.task.failure(view))
+        stage = verdict.stage
+        if self.task.stages:
+            holds = jnp.stack([condition(view) for condition in self.task.stages] + [jnp.array(False)])
+            stage = stage + (open_ & holds[stage])
+        done = (stage == len(self.task.stages)) & self.task.success(view)
+        return Verdict(verdict.succeeded | (open_ & ~failed & done), failed, stage.astype(jnp.int32))
 
     def _plan_one(self, state: SimState, action: Action) -> controller.Plan:
         return controller.plan(state.ctrl, state.eq_active, action, self._arms, self._welds)
@@ -147,14 +181,23 @@ class Environment:
             plan.closing,
             jnp.stack(bodies) if bodies else jnp.zeros((0, 7)),
             self._half_extents,
+            self._centres,
             self._welds,
         )
-        return state.replace(eq_active=eq_active, eq_data=eq_data, ik_failed=state.ik_failed | ~plan.ok)
+        if self.scene.attachments.size:
+            riding = eq_active[self.scene.attachments] & ~self.task.release(view)
+            eq_active = eq_active.at[self.scene.attachments].set(riding)
+        return state.replace(
+            eq_active=eq_active,
+            eq_data=eq_data,
+            grasped=state.grasped.at[self._welds].max(eq_active[self._welds]),
+            ik_failed=state.ik_failed | ~plan.ok,
+        )
 
     def _execute_on(self, plan_batch: Any, stepper: Any, attach_batch: Any) -> Callable[[SimState, Action], SimState]:
         def execute(state: SimState, action: Action) -> SimState:
             plan = plan_batch(state, action)
-            state = stepper(state, plan.controls, self._success_fn, plan.eq_active)
+            state = stepper(state, plan.controls, self._judge, plan.eq_active)
             return attach_batch(state, plan)
 
         return execute

@@ -2,13 +2,14 @@
 
 ``mujoco_stepper(model)`` and ``mjx_stepper(model)`` both return a function
 
-    run(state, controls, success_fn=None, eq_active=None) -> state
+    run(state, controls, judge=None, eq_active=None) -> state
 
-that applies float32 controls (B, S, nu), one row a physics step, to every episode of the batch, and latches
-``state.succeeded`` wherever ``success_fn`` holds after some step. ``success_fn`` is per example and takes the state
-with the step's qpos; of the physical fields only qpos and what does not change within a run (mocap poses, params) may
-be read by it. ``eq_active`` bool (B, S, neq) switches equality constraints step by step; the last row stays in the
-state.
+that applies float32 controls (B, S, nu), one row a physics step, to every episode of the batch. ``eq_active`` bool
+(B, S, neq) switches equality constraints step by step; the last row stays in the state.
+
+``judge(state) -> Verdict`` is per example and called after every step, with the verdict so far and the step's qpos and
+eq_active in the state; of the other physical fields it may read only what does not change within a run (mocap poses,
+variation).
 """
 
 import copy
@@ -27,6 +28,18 @@ from flax import struct
 from dsvla_jax.types import Array
 
 
+class Verdict(struct.PyTreeNode):
+    """How an episode is judged so far, latched.
+
+    succeeded, failed: bool (B,), whichever came first. stage: int32 (B,), how many of the conditions that must hold
+    one after the other have held.
+    """
+
+    succeeded: Array
+    failed: Array
+    stage: Array
+
+
 class SimState(struct.PyTreeNode):
     """The whole state of B episodes. Quaternions inside qpos and mocap_quat are wxyz, MuJoCo's order.
 
@@ -35,9 +48,10 @@ class SimState(struct.PyTreeNode):
     eq_active: bool (B, neq). eq_data: float32 (B, neq, mjNEQDATA); the rows of welds hold the relative pose.
     geom_xpos: float32 (B, ngeom, 3), geom_xmat: float32 (B, ngeom, 3, 3), world poses for the renderer.
     geom_rgba: float32 (B, ngeom, 4).
-    succeeded: bool (B,), latched. ik_failed: bool (B,), latched: some commanded pose was out of reach.
+    verdict: Verdict. ik_failed: bool (B,), latched: some commanded pose was out of reach.
+    grasped: bool (B, neq), latched: the welds that have ever held something.
     diverged: bool (B,), latched: the physics became non-finite, and the state is that of before the run.
-    params: the task's own parameters, a dict of arrays (B, ...).
+    variation: int32 (B,), the task's variation.
     """
 
     qpos: Array
@@ -50,23 +64,24 @@ class SimState(struct.PyTreeNode):
     geom_xpos: Array
     geom_xmat: Array
     geom_rgba: Array
-    succeeded: Array
+    verdict: Verdict
+    grasped: Array
     ik_failed: Array
     diverged: Array
-    params: dict[str, Array]
+    variation: Array
 
 
-SuccessFn = Callable[[SimState], Array]
+Judge = Callable[[SimState], Verdict]
 
 
 class Stepper(Protocol):
     def __call__(
-        self, state: SimState, controls: Array, success_fn: SuccessFn | None = None, eq_active: Array | None = None
+        self, state: SimState, controls: Array, judge: Judge | None = None, eq_active: Array | None = None
     ) -> SimState: ...
 
 
-def initial_state(model: mujoco.MjModel, batch: int, params: dict[str, Array] | None = None) -> SimState:
-    """``batch`` copies of the model's reference configuration, at rest. ``params``: arrays with the batch in front."""
+def initial_state(model: mujoco.MjModel, batch: int) -> SimState:
+    """``batch`` copies of the model's reference configuration, at rest."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
 
@@ -85,20 +100,22 @@ def initial_state(model: mujoco.MjModel, batch: int, params: dict[str, Array] | 
         geom_xpos=tile(data.geom_xpos),
         geom_xmat=tile(data.geom_xmat.reshape(-1, 3, 3)),
         geom_rgba=tile(model.geom_rgba),
-        succeeded=false,
+        verdict=Verdict(false, false, jnp.zeros(batch, jnp.int32)),
+        grasped=jnp.zeros((batch, model.neq), bool),
         ik_failed=false,
         diverged=false,
-        params=params or {},
+        variation=jnp.zeros(batch, jnp.int32),
     )
 
 
-def success_over_steps(success_fn: SuccessFn, state: SimState, qpos: Array) -> Array:
-    """Whether the predicate holds at any of the steps. qpos (B, S, nq) -> bool (B,)."""
+def judge_steps(judge: Judge, state: SimState, qpos: Array, eq_active: Array) -> Verdict:
+    """The verdict after S steps, per example: qpos (S, nq), eq_active (S, neq)."""
 
-    def one(state: SimState, qpos: Array) -> Array:
-        return jnp.any(jax.vmap(lambda q: success_fn(state.replace(qpos=q)))(qpos))
+    def step(verdict: Verdict, inputs: tuple[Array, Array]) -> tuple[Verdict, None]:
+        qpos, active = inputs
+        return judge(state.replace(qpos=qpos, eq_active=active, verdict=verdict)), None
 
-    return jax.vmap(one)(state, qpos)
+    return jax.lax.scan(step, state.verdict, (qpos, eq_active))[0]
 
 
 class MujocoStepper:
@@ -111,10 +128,10 @@ class MujocoStepper:
         self._data = [mujoco.MjData(model) for _ in range(self._threads)]
         # Weld poses are model fields, so each episode needs a model of its own.
         self._models: list[mujoco.MjModel] = []
-        self._predicates: dict[SuccessFn, Callable[[SimState, Array], Array]] = {}
+        self._judges: dict[Judge, Callable[[SimState, Array, Array], Verdict]] = {}
 
     def __call__(
-        self, state: SimState, controls: Array, success_fn: SuccessFn | None = None, eq_active: Array | None = None
+        self, state: SimState, controls: Array, judge: Judge | None = None, eq_active: Array | None = None
     ) -> SimState:
         model = self.model
         batch, steps, nu = controls.shape
@@ -151,17 +168,18 @@ class MujocoStepper:
         ok = np.isfinite(history).all(axis=(1, 2)) & (np.abs(history[:, -1, 0] - expected) < 0.5 * model.opt.timestep)
         history = np.where(ok[:, None, None], history[..., 1:], start[:, None, 1:]).astype(np.float32)
         qpos, qvel = history[..., : model.nq], history[..., model.nq :]
-        succeeded = np.asarray(state.succeeded)
-        if success_fn is not None:
-            if success_fn not in self._predicates:
-                self._predicates[success_fn] = jax.jit(lambda state, qpos: success_over_steps(success_fn, state, qpos))
-            succeeded = succeeded | (np.asarray(self._predicates[success_fn](state, qpos)) & ok)
+        verdict = state.verdict
+        if judge is not None:
+            if judge not in self._judges:
+                self._judges[judge] = jax.jit(jax.vmap(functools.partial(judge_steps, judge)))
+            judged = self._judges[judge](state, qpos, active)
+            verdict = jax.tree.map(lambda new, old: np.where(ok, new, old), judged, verdict)
         state = state.replace(
             qpos=qpos[:, -1],
             qvel=qvel[:, -1],
             ctrl=np.asarray(controls, np.float32)[:, -1],
             eq_active=active[:, -1],
-            succeeded=succeeded,
+            verdict=verdict,
             diverged=np.asarray(state.diverged) | ~ok,
         )
         return self.update_geometry(state)
@@ -203,7 +221,7 @@ class MjxStepper:
         self,
         state: SimState,
         controls: Array,
-        success_fn: SuccessFn | None = None,
+        judge: Judge | None = None,
         eq_active: Array | None = None,
         mjx_model: Any = None,
     ) -> SimState:
@@ -213,33 +231,32 @@ class MjxStepper:
             eq_active = jnp.broadcast_to(
                 jnp.asarray(state.eq_active)[:, None], (controls.shape[0], steps, state.eq_active.shape[-1])
             )
-        run = functools.partial(self._run_one, model, success_fn=success_fn)
+        run = functools.partial(self._run_one, model, judge=judge)
         return jax.vmap(run)(state, controls, eq_active)
 
-    def _run_one(
-        self, model: Any, state: SimState, controls: Array, eq_active: Array, success_fn: SuccessFn | None
-    ) -> SimState:
+    def _run_one(self, model: Any, state: SimState, controls: Array, eq_active: Array, judge: Judge | None) -> SimState:
         model = self._with_state(model, state)
         active_dtype = self._template.eq_active.dtype
         data = self._data(state)
 
-        def step(carry: tuple[Any, Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Any, Array, Array], None]:
-            data, succeeded, finite = carry
+        def step(carry: tuple[Any, Verdict, Array], inputs: tuple[Array, Array]) -> tuple[Any, None]:
+            data, verdict, finite = carry
             control, active = inputs
             data = self._mjx.step(model, data.replace(ctrl=control, eq_active=active.astype(active_dtype)))
             finite = finite & jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-            if success_fn is not None:
-                succeeded = succeeded | (finite & success_fn(state.replace(qpos=data.qpos)))
-            return (data, succeeded, finite), None
+            if judge is not None:
+                judged = judge(state.replace(qpos=data.qpos, eq_active=active, verdict=verdict))
+                verdict = jax.tree.map(lambda new, old: jnp.where(finite, new, old), judged, verdict)
+            return (data, verdict, finite), None
 
-        carry = (data, jnp.asarray(state.succeeded), jnp.array(True))
-        (data, succeeded, finite), _ = jax.lax.scan(step, carry, (controls, eq_active))
+        carry = (data, jax.tree.map(jnp.asarray, state.verdict), jnp.array(True))
+        (data, verdict, finite), _ = jax.lax.scan(step, carry, (controls, eq_active))
         state = state.replace(
             qpos=jnp.where(finite, data.qpos, state.qpos),
             qvel=jnp.where(finite, data.qvel, state.qvel),
             ctrl=controls[-1],
             eq_active=eq_active[-1],
-            succeeded=jnp.where(finite, succeeded, state.succeeded),
+            verdict=jax.tree.map(lambda new, old: jnp.where(finite, new, old), verdict, state.verdict),
             diverged=state.diverged | ~finite,
         )
         return self._with_geometry(model, state)

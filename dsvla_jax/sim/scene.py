@@ -1,5 +1,6 @@
 """One task's MuJoCo model: the table, the arms, the task's bodies, and where all of them are in the state's arrays."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from flax import struct
 
 from dsvla_jax.geometry import rotations
 from dsvla_jax.sim import robot
+from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.tasks import Placement, StateLayout, StateView, Task
 from dsvla_jax.types import TABLE_HEIGHT, Array
 
@@ -19,7 +21,7 @@ TABLE_RGBA = (0.62, 0.47, 0.34, 1.0)
 class GraspableBody:
     """A loose object that a closing gripper is welded to.
 
-    body: body id. qpos: address of its free joint. half_extents: float32 (3,), metres, in its frame.
+    body: body id. qpos: address of its free joint. half_extents, centre: float32 (3,), metres, in its frame.
     welds: int (A,), the equality constraint to each arm's hand. They begin inactive; their anchor and relative pose
         (eq_data) are written when the object is grasped.
     """
@@ -27,6 +29,7 @@ class GraspableBody:
     body: int
     qpos: int
     half_extents: np.ndarray
+    centre: np.ndarray
     welds: np.ndarray
 
 
@@ -35,6 +38,7 @@ class Scene:
     """A compiled task.
 
     arms: the left arm first; a single arm is called left. graspables: in the task's order.
+    attachments: int, the equality constraints of the task's attachments.
     initial: qpos (nq,), ctrl (nu,), mocap_pos (nmocap, 3), mocap_quat (nmocap, 4) wxyz and geom_rgba (ngeom, 4), all
         float32: the arms at their start, the task's bodies where they were built.
     """
@@ -44,11 +48,24 @@ class Scene:
     layout: StateLayout
     arms: tuple[robot.Arm, ...]
     graspables: tuple[GraspableBody, ...]
+    attachments: np.ndarray
     initial: "SceneState"
 
-    def view(self, qpos: Array, mocap_pos: Array, mocap_quat: Array) -> StateView:
-        """What the task's functions read: qpos (nq,), mocap_pos (nmocap, 3), mocap_quat (nmocap, 4) of one example."""
-        return StateView(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat, layout=self.layout)
+    @property
+    def welds(self) -> np.ndarray:
+        """int (A, N): the equality constraint between each hand and each graspable."""
+        return np.array([g.welds for g in self.graspables], np.int32).reshape(len(self.graspables), len(self.arms)).T
+
+    def view(self, state: SimState) -> StateView:
+        """What the task's functions read, of one example."""
+        return StateView(
+            qpos=state.qpos,
+            mocap_pos=state.mocap_pos,
+            mocap_quat=state.mocap_quat,
+            held=state.eq_active[self.welds],
+            variation=state.variation,
+            layout=self.layout,
+        )
 
     def place(self, placement: Placement) -> "SceneState":
         """The state in which an episode begins. Pure; vmap it over placements."""
@@ -103,10 +120,12 @@ def build_scene(task: Task) -> Scene:
     for graspable in task.graspables:
         for prefix in prefixes:
             _add_weld(spec, f"{prefix}hand", graspable.body)
+    for attachment in task.attachments:
+        _add_weld(spec, attachment.carrier, attachment.body, attachment.position, active=True)
     model = spec.compile()
 
     arms = tuple(robot.find_arm(model, prefix) for prefix in prefixes)
-    layout = _layout(model, prefixes)
+    layout = _layout(model, arms, tuple(graspable.body for graspable in task.graspables))
     return Scene(
         task=task,
         mj_model=model,
@@ -117,43 +136,48 @@ def build_scene(task: Task) -> Scene:
                 body=model.body(g.body).id,
                 qpos=layout.address("free", g.body),
                 half_extents=np.asarray(g.half_extents, np.float32),
+                centre=np.asarray(g.centre, np.float32),
                 welds=np.array([model.equality(_weld_name(f"{prefix}hand", g.body)).id for prefix in prefixes]),
             )
             for g in task.graspables
         ),
+        attachments=np.array([model.equality(_weld_name(a.carrier, a.body)).id for a in task.attachments], np.int32),
         initial=_initial_state(model, arms),
     )
 
 
-def _weld_name(hand: str, body: str) -> str:
-    return f"{hand}_holds_{body}"
+def _weld_name(carrier: str, body: str) -> str:
+    return f"{carrier}_holds_{body}"
 
 
-def _add_weld(spec: mujoco.MjSpec, hand: str, body: str) -> None:
+def _add_weld(
+    spec: mujoco.MjSpec, carrier: str, body: str, position: Sequence[float] = (0.0, 0.0, 0.0), active: bool = False
+) -> None:
     weld = spec.add_equality(
-        name=_weld_name(hand, body),
+        name=_weld_name(carrier, body),
         type=mujoco.mjtEq.mjEQ_WELD,
-        name1=hand,
+        name1=carrier,
         name2=body,
         objtype=mujoco.mjtObj.mjOBJ_BODY,
-        active=False,
+        active=active,
     )
     # anchor (3), relative position (3), relative quaternion wxyz (4), torque scale
-    weld.data[:11] = [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]
+    weld.data[:11] = [0, 0, 0, *position, 1, 0, 0, 0, 1]
     weld.solref = [0.01, 1.0]
 
 
-def _layout(model: mujoco.MjModel, arm_prefixes: tuple[str, ...]) -> StateLayout:
+def _layout(model: mujoco.MjModel, arms: tuple[robot.Arm, ...], graspables: tuple[str, ...]) -> StateLayout:
     free, joints = {}, {}
+    prefixes = tuple(arm.prefix for arm in arms)
     for i in range(model.njnt):
         joint = model.joint(i)
         if joint.type[0] == mujoco.mjtJoint.mjJNT_FREE:
             free[model.body(joint.bodyid[0]).name] = int(joint.qposadr[0])
-        elif not joint.name.startswith(arm_prefixes):
+        elif not joint.name.startswith(prefixes):
             joints[joint.name] = int(joint.qposadr[0])
     bodies = (model.body(i) for i in range(model.nbody))
     mocap = {body.name: int(body.mocapid[0]) for body in bodies if body.mocapid[0] >= 0}
-    return StateLayout(free=free, mocap=mocap, joints=joints)
+    return StateLayout(free=free, mocap=mocap, joints=joints, graspables=graspables, arms=arms)
 
 
 def _initial_state(model: mujoco.MjModel, arms: tuple[robot.Arm, ...]) -> SceneState:

@@ -1,16 +1,26 @@
-"""The manipulation tasks, by their RLBench names."""
+"""The manipulation tasks, by their RLBench names: every module of this package that has a ``TASK``."""
 
 import difflib
+import importlib
+import pkgutil
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.sim.tasks import bimanual_lift_ball, close_fridge, lamp_on, put_rubbish_in_bin
-from dsvla_jax.sim.tasks.task import Graspable, Placement, StateLayout, StateView, Task
+from dsvla_jax.sim.tasks.task import Attachment, Graspable, Placement, StateLayout, StateView, Task
 
-__all__ = ["TASKS", "Graspable", "Placement", "StateLayout", "StateView", "Task", "get_task"]
+__all__ = [
+    "TASKS",
+    "Attachment",
+    "Graspable",
+    "Placement",
+    "StateLayout",
+    "StateView",
+    "Task",
+    "get_task",
+    "select_tasks",
+]
 
-TASKS: dict[str, Task] = {
-    module.TASK.name: module.TASK for module in (lamp_on, put_rubbish_in_bin, close_fridge, bimanual_lift_ball)
-}
+_MODULES = [importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
+TASKS: dict[str, Task] = {module.TASK.name: module.TASK for module in _MODULES if hasattr(module, "TASK")}
 
 
 def get_task(name: str) -> Task:
@@ -20,3 +30,15 @@ def get_task(name: str) -> Task:
         hint = f"did you mean {close[0]!r}?" if close else "see dsvla_jax.sim.tasks.TASKS."
         raise UserError(f"unknown task {name!r}: {hint} The tasks are {', '.join(TASKS)}.")
     return TASKS[name]
+
+
+def select_tasks(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of tasks, with ``all``, ``single_arm`` and ``dual_arm`` and lists with commas spelled out, none twice."""
+    groups = {
+        "all": tuple(TASKS),
+        "single_arm": tuple(name for name, task in TASKS.items() if task.num_arms == 1),
+        "dual_arm": tuple(name for name, task in TASKS.items() if task.num_arms == 2),
+    }
+    words = [word for name in names for word in name.split(",") if word]
+    chosen = [name for word in words for name in groups.get(word, (word,))]
+    return tuple(get_task(name).name for name in dict.fromkeys(chosen))

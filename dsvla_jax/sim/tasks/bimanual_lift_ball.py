@@ -21,7 +21,7 @@ def _build(spec) -> None:
     task.add_part(ball, "ball", task.SPHERE, [RADIUS], [0, 0, 0], orange, OBJECT, mass=0.15)
 
 
-def _sample(key: Array) -> task.Placement:
+def _sample(key: Array, variation: Array) -> task.Placement:
     low, high = jnp.array([0.08, -0.06, -jnp.pi / 8]), jnp.array([0.2, 0.06, jnp.pi / 8])
     x, y, yaw = jax.random.uniform(key, (3,), minval=low, maxval=high)
     return task.Placement(free={"ball": task.upright_pose(x, y, TABLE_HEIGHT + RADIUS, yaw)})

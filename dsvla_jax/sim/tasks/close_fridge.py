@@ -49,7 +49,7 @@ def _build(spec) -> None:
     task.add_part(door, "fridge_door_handle", task.CAPSULE, [0.008, 0.04], [HANDLE, -0.025, -0.02], dark)
 
 
-def _sample(key: Array) -> task.Placement:
+def _sample(key: Array, variation: Array) -> task.Placement:
     low, high = jnp.array([0.14, 0.02, -jnp.pi / 4]), jnp.array([0.22, 0.12, jnp.pi / 4])
     x, y, yaw = jax.random.uniform(key, (3,), minval=low, maxval=high)
     return task.Placement(

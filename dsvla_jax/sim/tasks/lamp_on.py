@@ -33,7 +33,7 @@ def _build(spec) -> None:
     task.add_part(button, "lamp_button", task.CAPSULE, [0.024, 0.003], [0, 0, -0.027], green, FIXTURE, mass=0.05)
 
 
-def _sample(key: Array) -> task.Placement:
+def _sample(key: Array, variation: Array) -> task.Placement:
     low, high = jnp.array([0.12, -0.12, -jnp.pi]), jnp.array([0.22, 0.12, jnp.pi])
     x, y, yaw = jax.random.uniform(key, (3,), minval=low, maxval=high)
     return task.Placement(mocap={"lamp": task.upright_pose(x, y, TABLE_HEIGHT, yaw)})

@@ -44,7 +44,7 @@ def _build(spec) -> None:
         task.add_part(tomato, f"{name}_stem", task.CAPSULE, [0.005, 0.004], [0, 0, TOMATO], [0.15, 0.5, 0.1, 1])
 
 
-def _sample(key: Array) -> task.Placement:
+def _sample(key: Array, variation: Array) -> task.Placement:
     place_key, order_key, turn_key = jax.random.split(key, 3)
     # Turned further, the bin would stand between the front camera and the rubbish.
     low, high = jnp.array([0.12, -0.1, -2.0]), jnp.array([0.2, 0.1, 2.0])

@@ -16,7 +16,8 @@ import numpy as np
 from flax import struct
 
 from dsvla_jax.geometry import rotations
-from dsvla_jax.sim.robot import VISUAL, CollisionBits
+from dsvla_jax.sim.kinematics import forward_kinematics
+from dsvla_jax.sim.robot import VISUAL, Arm, CollisionBits
 from dsvla_jax.types import TABLE_HEIGHT, Action, Array
 
 BOX = mujoco.mjtGeom.mjGEOM_BOX
@@ -37,6 +38,8 @@ class StateLayout:
     free: Mapping[str, int]  # body -> address of its free joint in qpos
     mocap: Mapping[str, int]  # body -> index into mocap_pos and mocap_quat
     joints: Mapping[str, int]  # hinge or slide joint -> address in qpos
+    graspables: tuple[str, ...]  # bodies, in the task's order
+    arms: tuple[Arm, ...]  # the left one first; a single arm is called left
 
     # A layout belongs to one model, and is compared by identity so that it can be static under jit.
     __hash__ = object.__hash__
@@ -55,11 +58,15 @@ class StateView:
     """The state of one example, read by name.
 
     qpos: float32 (nq,). mocap_pos: float32 (nmocap, 3). mocap_quat: float32 (nmocap, 4), MuJoCo's order wxyz.
+    held: bool (A, N), which of the task's N graspables are attached to each hand.
+    variation: int32 (), which variation of the task this episode is.
     """
 
     qpos: Array
     mocap_pos: Array
     mocap_quat: Array
+    held: Array
+    variation: Array
     layout: StateLayout = struct.field(pytree_node=False)
 
     def body_pose(self, name: str) -> Array:
@@ -74,6 +81,18 @@ class StateView:
     def joint(self, name: str) -> Array:
         """The value () of a hinge (radians) or a slide (metres)."""
         return self.qpos[self.layout.address("joints", name)]
+
+    def tool_poses(self) -> Array:
+        """The poses (A, 7) of the tool centre points."""
+        return jnp.stack([forward_kinematics(self.qpos[arm.joints], arm.base) for arm in self.layout.arms])
+
+    def holds(self, name: str) -> Array:
+        """bool (): whether any hand holds that graspable."""
+        return jnp.any(self.held[:, self.layout.graspables.index(name)])
+
+    def holds_nothing(self) -> Array:
+        """bool (): whether all hands are empty."""
+        return ~jnp.any(self.held)
 
 
 @struct.dataclass
@@ -92,13 +111,31 @@ class Placement:
 
 @dataclasses.dataclass(frozen=True)
 class Graspable:
-    """A loose object that a closing gripper attaches to, if the tool centre point is within (about) its box.
+    """A loose object that a closing gripper attaches to, if the tool centre point is within 1 cm of its box.
 
-    half_extents: metres, in the body's frame.
+    half_extents: metres. centre: of the box. Both in the body's frame.
     """
 
     body: str
     half_extents: tuple[float, float, float]
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Attachment:
+    """A loose object that rides on another body until the task releases it (`Task.release`).
+
+    position: metres, where its origin is in the carrier's frame; its axes are the carrier's.
+    """
+
+    body: str
+    carrier: str
+    position: tuple[float, float, float]
+
+
+def never(view: StateView) -> Array:
+    """A predicate that never holds."""
+    return jnp.array(False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,22 +143,47 @@ class Task:
     """One task. ``view`` arguments are of one example; M is the number of the expert's keyframes.
 
     build: adds the task's bodies to an MjSpec that has the table; names begin with the task's own words.
-    sample: PRNG key -> Placement.
-    instructions: ways to say the task; the first is the plain one.
-    keypoints: view -> float32 (A, K, 3), for each arm the points to go to, in the order of the instruction.
-    success: view -> bool ().
-    expert: view at reset -> Action with a leading axis M: the key poses of a demonstration.
+    sample: (PRNG key, variation int32 ()) -> Placement.
+    instructions: ways to say the task, the plain one first; {words} in braces are filled in by ``words``.
+    keypoints: view -> float32 (A, K, 3), for each arm the points to go to, in the order of the instruction. A task with
+        fewer in some variations repeats the last one.
+    success: view -> bool (), after every physics step.
+    expert: view at reset -> Action with a leading axis M: the key poses of a demonstration. A variation that needs
+        fewer repeats the last one.
+    variations: how many there are. words: variation -> what fills the braces of the instructions.
+    stages: conditions that must have held before success counts, one after the other.
+    failure: view -> bool (): once it holds, the episode has failed for good.
+    graspables: what a closing gripper attaches to. targets: view -> bool (N,), which of them it is right to take;
+        None: all of them.
+    attachments: objects that ride on others. release: view -> bool (), judged after every keyframe: lets them go.
     """
 
     name: str
     num_arms: int
     build: Callable[[Any], None]
-    sample: Callable[[Array], Placement]
+    sample: Callable[[Array, Array], Placement]
     instructions: tuple[str, ...]
     keypoints: Callable[[StateView], Array]
     success: Callable[[StateView], Array]
     expert: Callable[[StateView], Action]
+    variations: int = 1
+    words: Callable[[int], Mapping[str, str]] = lambda variation: {}
+    stages: tuple[Callable[[StateView], Array], ...] = ()
+    failure: Callable[[StateView], Array] = never
     graspables: tuple[Graspable, ...] = ()
+    targets: Callable[[StateView], Array] | None = None
+    attachments: tuple[Attachment, ...] = ()
+    release: Callable[[StateView], Array] = never
+
+    def say(self, variation: int, way: int = 0) -> str:
+        """The instruction of a variation, in one of the ways (counted round)."""
+        return self.instructions[way % len(self.instructions)].format(**self.words(variation))
+
+    def all_instructions(self) -> list[str]:
+        """Every way to say every variation."""
+        return [
+            self.say(variation, way) for variation in range(self.variations) for way in range(len(self.instructions))
+        ]
 
 
 def add_part(
