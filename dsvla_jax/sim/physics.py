@@ -172,7 +172,7 @@ class MujocoStepper:
         if judge is not None:
             if judge not in self._judges:
                 self._judges[judge] = jax.jit(jax.vmap(functools.partial(judge_steps, judge)))
-            judged = self._judges[judge](state, qpos, active)
+            judged = self._judges[judge](state, jnp.asarray(qpos), jnp.asarray(active))
             verdict = jax.tree.map(lambda new, old: np.where(ok, new, old), judged, verdict)
         state = state.replace(
             qpos=qpos[:, -1],

@@ -84,7 +84,7 @@ class StateView:
 
     def tool_poses(self) -> Array:
         """The poses (A, 7) of the tool centre points."""
-        return jnp.stack([forward_kinematics(self.qpos[arm.joints], arm.base) for arm in self.layout.arms])
+        return jnp.stack([forward_kinematics(self.qpos[arm.joints], jnp.asarray(arm.base)) for arm in self.layout.arms])
 
     def holds(self, name: str) -> Array:
         """bool (): whether any hand holds that graspable."""
