@@ -185,7 +185,9 @@ class Environment:
             self._welds,
         )
         if self.scene.attachments.size:
-            riding = eq_active[self.scene.attachments] & ~self.task.release(view)
+            # What the hand has just taken counts as held: it would otherwise be dragged back by its carrier.
+            after = self.view(state.replace(eq_active=eq_active))
+            riding = eq_active[self.scene.attachments] & ~self.task.release(after)
             eq_active = eq_active.at[self.scene.attachments].set(riding)
         return state.replace(
             eq_active=eq_active,

@@ -215,6 +215,20 @@ def upright_pose(x: Array, y: Array, z: Array | float, yaw: Array | float = 0.0)
     return jnp.concatenate([position, rotations.quaternion_from_axis_angle(up, jnp.asarray(yaw, jnp.float32))])
 
 
+def pointing_down(yaw: Array | float = 0.0) -> Array:
+    """The quaternion (4,) of a gripper straight down whose fingers open along the y axis of a body turned by ``yaw``
+    radians about the vertical. Of the two turns half a circle apart, which grasp alike, the one within a quarter."""
+    yaw = jnp.mod(jnp.asarray(yaw, jnp.float32) + jnp.pi / 2, jnp.pi) - jnp.pi / 2
+    turn = rotations.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw)
+    return rotations.quaternion_multiply(turn, rotations.DOWN)
+
+
+def yaw_of(pose: Array) -> Array:
+    """How far (), in radians, a body's pose (7,) is turned about the vertical: the heading of its x axis."""
+    x, y, _ = rotations.quaternion_rotate(pose[3:], jnp.array([1.0, 0.0, 0.0]))
+    return jnp.arctan2(y, x)
+
+
 def point_in_world(pose: Array, point: Any) -> Array:
     """A point (3,) of a body's frame, in the world. pose (7,), point (3,) -> (3,)."""
     return pose[:3] + rotations.quaternion_rotate(pose[3:], jnp.asarray(point, jnp.float32))
@@ -226,7 +240,7 @@ def point_in_body(pose: Array, point: Array) -> Array:
 
 
 def key_poses(positions: Any, grippers: list[float], quaternion: Any = rotations.DOWN) -> Action:
-    """The keyframes of one arm with one constant orientation: M positions (3,) -> Action with axes (M, 1, ...)."""
+    """The keyframes of one arm: M positions (3,) -> Action (M, 1, ...). quaternion: (4,), or (M, 4) of each."""
     points = jnp.stack([jnp.asarray(position, jnp.float32) for position in positions])
     turns = jnp.broadcast_to(jnp.asarray(quaternion, jnp.float32), (len(points), 4))
     return Action(
