@@ -44,7 +44,7 @@ def _expert(view: task.StateView) -> Action:
     mirrored = offsets * jnp.array([1.0, -1.0, 1.0])
     left = task.key_poses(centre + offsets, [task.OPEN] * len(KEYFRAMES), SIDEWAYS)
     right = task.key_poses(centre + mirrored, [task.OPEN] * len(KEYFRAMES), SIDEWAYS)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), left, right)
+    return task.both_arms(left, right)
 
 
 TASK = task.Task(

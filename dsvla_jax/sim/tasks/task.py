@@ -247,3 +247,8 @@ def key_poses(positions: Any, grippers: list[float], quaternion: Any = rotations
         pose=jnp.concatenate([points, turns], axis=-1)[:, None],
         gripper_open=jnp.asarray(grippers, jnp.float32)[:, None],
     )
+
+
+def both_arms(left: Action, right: Action) -> Action:
+    """The keyframes (M, 1, ...) of the left and of the right arm, executed at the same time: (M, 2, ...)."""
+    return jax.tree.map(lambda *arms: jnp.concatenate(arms, axis=1), left, right)
