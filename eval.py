@@ -1,4 +1,4 @@
-"""Evaluate a run in closed loop: python eval.py RUN [--physics mjx] [--tasks lamp_on ...] [--episodes 25]
+"""Evaluate a run in closed loop: python eval.py RUN [--tasks all] [--episodes 25] [--physics mjx] [--compare RUN ...]
 
 Every episode starts from a seed that no demonstration used. Prints success rates with Wilson 95 % intervals and writes,
 in RUN/eval, one line of JSON an episode and an HTML report with a film strip of each.
@@ -12,20 +12,32 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import jax
+import cv2
 import numpy as np
 import tyro
 from tqdm import tqdm
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.compile_times import first_use
 from dsvla_jax.errors import UserError
+from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.policy import Policy, load_policy
-from dsvla_jax.report import EpisodeResult, mark_targets, print_table, read_results, write_report, write_results
+from dsvla_jax.report import (
+    EpisodeResult,
+    film_strip,
+    mark_targets,
+    print_comparison,
+    print_table,
+    read_results,
+    write_report,
+    write_results,
+)
+from dsvla_jax.rollout import Ending, run_episodes
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import get_task
+from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, load_experiment
+from dsvla_jax.types import Camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,111 +49,117 @@ class Options:
     physics: Literal["mujoco", "mjx"] = "mujoco"
     """C MuJoCo on the processor, or vectorised MJX on whatever device JAX has."""
     tasks: tuple[str, ...] = ()
-    """Which tasks; those the run was trained on if not given."""
+    """Names (with spaces or commas between), all, single_arm or dual_arm; those the run was trained on if not given."""
     episodes: int | None = None
     """Unseen episodes a task; the config's number if not given."""
+    batch: int = 100
+    """Most episodes side by side."""
     keypoint_noise: float = 0.0
     """Metres of uniform noise an axis on every keypoint (paper, section 4.3: up to 0.1)."""
     seed: int = 0
     skip_finished: bool = False
-    """Leave a finished evaluation of this checkpoint as it is."""
+    """Leave the tasks as they are that have been evaluated since the last training."""
+    compare: tuple[Path, ...] = ()
+    """Other runs: evaluates nothing, prints what is in RUN/eval and theirs side by side."""
 
 
 def main(options: Options) -> None:
     """Evaluates, prints the table, writes results and report."""
+    if options.compare:
+        runs = (options.run, *options.compare)
+        print_comparison({str(run): read_results(results_file(run, options)) for run in runs})
+        return
     if not (options.run / "config.json").exists():
         raise UserError(f"{options.run}: no run here (config.json is missing); train one: python train.py CONFIG")
     experiment = load_experiment(options.run / "config.json")
-    tasks = options.tasks or experiment.data.tasks
-    for name in tasks:
-        get_task(name)
+    tasks = select_tasks(options.tasks or experiment.data.tasks)
     episodes = options.episodes or experiment.evaluation.episodes
-    folder = options.run / "eval"
-    noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
-    file = folder / f"{options.physics}{noise}.jsonl"
-    if options.skip_finished and is_finished(file, options.run, tasks, episodes):
+    file = results_file(options.run, options)
+    kept = finished_results(file, options.run, episodes) if options.skip_finished else []
+    missing = [name for name in tasks if name not in {result.task for result in kept}]
+    results = kept
+    if missing:
+        policy = load_policy(options.run)
+        for name in missing:
+            endings = evaluate_task(policy, experiment, name, episodes, options)
+            save_strips(file, name, endings, front_camera(experiment.data.image_size))
+            results = results + [
+                EpisodeResult(name, i, options.physics, e.success, e.reason, e.keyframes, e.instruction, e.answers)
+                for i, e in enumerate(endings)
+            ]
+            write_results(file, results)
+    else:
         print(f"{file} is newer than the training and complete: nothing to do")
-        print_table(read_results(file))
-        return
-
-    policy = load_policy(options.run)
-    results: list[EpisodeResult] = []
-    strips: dict[tuple[str, int], list[np.ndarray]] = {}
-    for name in tasks:
-        outcome, films = evaluate_task(policy, experiment, name, episodes, options)
-        results += outcome
-        strips |= {(name, result.seed): film for result, film in zip(outcome, films, strict=True)}
-    write_results(file, results)
-    other = folder / f"{'mjx' if options.physics == 'mujoco' else 'mujoco'}{noise}.jsonl"
-    report = file.with_suffix(".html")
-    write_report(report, results, strips, read_results(other) if other.exists() else None, title=str(options.run))
     print_table(results)
+    report = file.with_suffix(".html")
+    if missing or not report.exists():
+        other = results_file(options.run, dataclasses.replace(options, physics=other_physics(options.physics)))
+        strips = load_strips(file, results)
+        write_report(report, results, strips, read_results(other) if other.exists() else None, title=str(options.run))
     print(f"report: {report}")
 
 
-def is_finished(file: Path, run: Path, tasks: Sequence[str], episodes: int) -> bool:
-    """Whether the file holds all these episodes, evaluated after the last training."""
+def results_file(run: Path, options: Options) -> Path:
+    """Where the results of these conditions are kept; the physics alone name the plain ones."""
+    noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
+    seed = f"-seed-{options.seed}" if options.seed else ""
+    return run / "eval" / f"{options.physics}{noise}{seed}.jsonl"
+
+
+def other_physics(physics: str) -> str:
+    """The kind of physics to compare with."""
+    return "mjx" if physics == "mujoco" else "mujoco"
+
+
+def finished_results(file: Path, run: Path, episodes: int) -> list[EpisodeResult]:
+    """What the file holds of tasks evaluated on at least so many episodes since the last training."""
     if not file.exists() or file.stat().st_mtime < (run / "metrics.jsonl").stat().st_mtime:
-        return False
-    done = Counter(result.task for result in read_results(file))
-    return all(done[task] >= episodes for task in tasks)
+        return []
+    results = read_results(file)
+    count = Counter(result.task for result in results)
+    return [result for result in results if count[result.task] >= episodes]
 
 
-def evaluate_task(
-    policy: Policy, experiment: Experiment, name: str, episodes: int, options: Options
-) -> tuple[list[EpisodeResult], list[list[np.ndarray]]]:
-    """All episodes of one task side by side. Returns their results and the frames that the policy saw."""
-    task = get_task(name)
-    environment = Environment(task, physics=options.physics, image_size=experiment.data.image_size)
-    keys = episode_keys(options.seed, "eval", name, 0, episodes)
-    limit = experiment.evaluation.max_keyframes
-    with tqdm(total=limit, desc=f"{name} x {episodes} ({options.physics})", unit="keyframe") as bar:
-        bar.set_postfix_str("resetting; the first use compiles")
-        state = environment.reset(keys)
-        instructions = environment.instructions(state, np.arange(episodes))
-        keypoints = np.asarray(environment.keypoints(state))
-        noise = np.random.default_rng(options.seed).uniform(-1, 1, keypoints.shape) * options.keypoint_noise
-        keypoints = (keypoints + noise).astype(np.float32)
-        latched = np.zeros(keypoints.shape[:2], np.int32)
-        success = np.asarray(environment.success(state))
-        frames: list[list[np.ndarray]] = [[] for _ in range(episodes)]
-        actions: list[list[str]] = [[] for _ in range(episodes)]
-        used = np.zeros(episodes, int)
-        unreachable = np.zeros(episodes, bool)
-        for _ in range(limit):
-            observation = environment.observe(state)
-            latched = np.asarray(jax.vmap(advance_latch)(latched, observation.pose[..., :3], keypoints))
-            active = np.asarray(jax.vmap(jax.vmap(active_keypoint))(latched, keypoints))
-            action, answers = policy.act(observation, instructions, active)
-            rgb, targets = np.asarray(observation.rgb), np.asarray(action.pose)[..., :3]
-            for i in np.flatnonzero(~success):
-                frames[i].append(mark_targets(rgb[i], targets[i], environment.camera))
-                actions[i].append(answers[i])
-            used += ~success
-            state = environment.execute(state, action)
-            unreachable |= np.asarray(state.ik_failed) & ~success
-            success = np.asarray(environment.success(state))
-            bar.update()
-            bar.set_postfix_str(f"{success.sum()}/{episodes} succeeded")
-            if success.all():
-                break
-        last = np.asarray(environment.observe(state).rgb)
-        diverged = np.asarray(state.diverged)
-    results = []
-    for i in range(episodes):
-        frames[i].append(last[i])
-        reason = "" if success[i] else failure_reason(bool(diverged[i]), bool(unreachable[i]))
-        results.append(
-            EpisodeResult(name, i, options.physics, bool(success[i]), reason, int(used[i]), instructions[i], actions[i])
-        )
-    return results, frames
+def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: int, options: Options) -> list[Ending]:
+    """All episodes of one task, ``options.batch`` of them side by side."""
+    environment = Environment(name, physics=options.physics, image_size=experiment.data.image_size)
+    size = min(episodes, options.batch)
+    endings: list[Ending] = []
+    with tqdm(total=episodes, desc=f"{name} ({options.physics})", unit="episode") as bar:
+        for start in range(0, episodes, size):
+            # The last batch is filled up with further episodes: another size would compile again.
+            keys = episode_keys(options.seed, "eval", name, start, size)
+            if start == 0:
+                with first_use(f"{name} {options.physics} x {size}", bar.set_postfix_str):
+                    keypoints = environment.keypoints(environment.reset(keys))
+            noise = np.random.default_rng([options.seed, start]).uniform(-1, 1, keypoints.shape)
+            endings += run_episodes(
+                environment,
+                policy.act,
+                keys,
+                noise=noise * options.keypoint_noise,
+                on_keyframe=lambda done, succeeded: bar.set_postfix_str(
+                    f"key pose {done}, {succeeded}/{size} succeeded"
+                ),
+            )
+            bar.update(min(size, episodes - start))
+    return endings[:episodes]
 
 
-def failure_reason(diverged: bool, unreachable: bool) -> str:
-    """Why an episode without success failed, the gravest reason first."""
-    if diverged:
-        return "the simulation diverged"
-    return "a pose was out of reach" if unreachable else "out of keyframes"
+def save_strips(file: Path, task: str, endings: Sequence[Ending], camera: Camera) -> None:
+    """Writes the film strip of every episode beside the results, each target marked in the frame it was answered to."""
+    folder = file.with_suffix("")
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, ending in enumerate(endings):
+        marked = [mark_targets(f, t, camera) for f, t in zip(ending.frames, ending.targets, strict=False)]
+        cv2.imwrite(str(folder / f"{task}-{i}.png"), film_strip([*marked, ending.frames[-1]])[..., ::-1])
+
+
+def load_strips(file: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str, int], list[np.ndarray]]:
+    """The film strips of the results that have one, as `write_report` takes them."""
+    paths = {(r.task, r.seed): file.with_suffix("") / f"{r.task}-{r.seed}.png" for r in results}
+    pictures = {key: cv2.imread(str(path)) for key, path in paths.items()}
+    return {key: [picture[..., ::-1]] for key, picture in pictures.items() if picture is not None}
 
 
 if __name__ == "__main__":

@@ -24,9 +24,13 @@ def fail_with_message() -> Iterator[None]:
         sys.exit(130)
 
 
+def cache_folder() -> Path:
+    """Where things are kept that can be made again."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dsvla_jax"
+
+
 def configure_jax() -> None:
     """Keeps compiled programs on disk, so that the second run of anything starts at once."""
-    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dsvla_jax" / "xla"
     if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", str(default))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

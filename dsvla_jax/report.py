@@ -116,6 +116,30 @@ def print_table(results: Sequence[EpisodeResult], console: Console | None = None
     (console or Console()).print(table)
 
 
+def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Console | None = None) -> None:
+    """Success rates of several runs side by side, a row a task that any of them has; results by the run's name."""
+    rates = {name: {rate.name: rate for rate in success_rates(results)} for name, results in sets.items()}
+    table = Table(title="closed-loop success, % (95 % interval)")
+    table.add_column("task")
+    for name in sets:
+        table.add_column(name, justify="right")
+    for task in dict.fromkeys(task for of_run in rates.values() for task in of_run):
+        cells = [_rate_cell(of_run.get(task)) for of_run in rates.values()]
+        table.add_row(task, *cells)
+    table.add_section()
+    common = set.intersection(*(set(of_run) for of_run in rates.values()))
+    means = [100 * macro_mean([rate for task, rate in of_run.items() if task in common]) for of_run in rates.values()]
+    table.add_row(f"mean of the {len(common)} tasks that all have", *(f"{mean:.1f}" for mean in means))
+    (console or Console()).print(table)
+
+
+def _rate_cell(rate: SuccessRate | None) -> str:
+    if rate is None:
+        return "-"
+    low, high = rate.interval
+    return f"{100 * rate.rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+
+
 def _cells(rate: SuccessRate) -> tuple[str, str, str, str]:
     low, high = rate.interval
     return (

@@ -18,6 +18,7 @@ from dsvla_jax.report import (
     film_strip,
     macro_mean,
     mark_targets,
+    print_comparison,
     print_table,
     read_results,
     success_rates,
@@ -157,3 +158,13 @@ def test_the_report_is_one_page_that_holds_everything(tmp_path):
     assert "Where physics differ" not in path.read_text()
     write_report(path, [])
     assert "no episodes" in path.read_text()
+
+
+def test_runs_are_compared_on_the_tasks_that_all_have():
+    console = Console(record=True, width=100, file=io.StringIO())
+    other = [result("lamp_on", seed, True) for seed in range(4)]
+    print_comparison({"one": RESULTS, "two": other}, console)
+    text = console.export_text()
+    assert re.search(r"lamp_on\D+75\.0 \(30 to 95\)\D+100\.0 \(51 to 100\)", text)
+    assert re.search(r"lift_ball\D+0\.0 \(0 to 79\)\D+-", text)
+    assert re.search(r"mean of the 1 tasks that all have\D+75\.0\D+100\.0", text)

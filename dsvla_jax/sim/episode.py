@@ -63,6 +63,7 @@ class Environment:
         self._render = jax.jit(jax.vmap(self._render_one))
         self._end_effector = jax.jit(jax.vmap(lambda qpos: controller.end_effector(qpos, self._arms)))
         self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
+        self._taken = jax.jit(jax.vmap(self._taken_one))
         self._expert = jax.jit(jax.vmap(lambda state: self.task.expert(self.view(state))))
         if physics == "mujoco":
             stepper = physics_module.mujoco_stepper(self.scene.mj_model)
@@ -143,6 +144,18 @@ class Environment:
             for v, w in zip(variations, np.broadcast_to(way, len(variations)), strict=True)
         ]
 
+    def took_wrong_object(self, state: SimState) -> Array:
+        """bool (B,): some hand has ever held a graspable that is not among the task's targets."""
+        return self._taken(state)[0]
+
+    def dropped(self, state: SimState) -> Array:
+        """bool (B,): a target has been held, and none is held now."""
+        return self._taken(state)[1]
+
+    def keyframe_limit(self, state: SimState) -> int:
+        """Key poses after which an episode is over: twice as many as the scripted expert takes."""
+        return 2 * jax.eval_shape(self._expert, state).pose.shape[1]
+
     def keypoints(self, state: SimState) -> Array:
         """float32 (B, A, K, 3), the task's keypoints as the objects are now."""
         return self._keypoints(state)
@@ -166,6 +179,13 @@ class Environment:
             stage = stage + (open_ & holds[stage])
         done = (stage == len(self.task.stages)) & self.task.success(view)
         return Verdict(verdict.succeeded | (open_ & ~failed & done), failed, stage.astype(jnp.int32))
+
+    def _taken_one(self, state: SimState) -> tuple[Array, Array]:
+        if not self._welds.size:
+            return jnp.array(False), jnp.array(False)
+        view, ever = self.view(state), jnp.any(state.grasped[self._welds], axis=0)
+        right = jnp.ones_like(ever) if self.task.targets is None else self.task.targets(view)
+        return jnp.any(ever & ~right), jnp.any(ever & right) & ~jnp.any(view.held & right)
 
     def _plan_one(self, state: SimState, action: Action) -> controller.Plan:
         return controller.plan(state.ctrl, state.eq_active, action, self._arms, self._welds)

@@ -31,7 +31,7 @@ class EvaluationConfig:
     """Closed-loop evaluation on unseen episodes."""
 
     episodes: int = 25
-    max_keyframes: int = 8
+    """Unseen episodes a task."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -98,5 +98,6 @@ TASK = task.Task(
     keypoints=_keypoints,
     success=_success,
     expert=_expert,
-    graspables=(task.Graspable("rubbish", (RUBBISH, RUBBISH, RUBBISH)),),
+    graspables=(task.Graspable("rubbish", (RUBBISH,) * 3), *(task.Graspable(o, (TOMATO,) * 3) for o in OBJECTS[1:])),
+    targets=lambda view: jnp.array([True, False, False]),
 )

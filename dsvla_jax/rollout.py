@@ -1,0 +1,102 @@
+"""Closed loop on the host: a policy acts in many episodes of one task at a time, and why each ended as it did.
+
+A policy is any function (Observation, B instructions, active keypoints (B, A, 3)) -> (Action, B answers as text).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+
+from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState
+from dsvla_jax.types import Action, Array, Observation
+
+Act = Callable[[Observation, Sequence[str], np.ndarray], tuple[Action, Sequence[str]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Ending:
+    """One finished episode.
+
+    reason: why it failed, empty on success. keyframes: key poses executed. answers: the policy's text for each.
+    frames: uint8 (H, W, 3), what the policy saw before each key pose, and the last view.
+    targets: float32 (A, 3), the position that it answered to each frame but the last.
+    """
+
+    success: bool
+    reason: str
+    keyframes: int
+    instruction: str
+    answers: list[str]
+    frames: list[np.ndarray]
+    targets: list[np.ndarray]
+
+
+def run_episodes(
+    environment: Environment,
+    act: Act,
+    keys: Array,
+    limit: int | None = None,
+    noise: np.ndarray | float = 0.0,
+    on_keyframe: Callable[[int, int], None] = lambda done, succeeded: None,
+) -> list[Ending]:
+    """Runs one episode a key to its end, side by side.
+
+    limit: key poses after which an episode is over; twice the expert's if not given.
+    noise: metres added to the keypoints, (B, A, K, 3) or a number.
+    on_keyframe: told the number of key poses done and of successes so far.
+    """
+    batch = len(keys)
+    state = environment.reset(keys)
+    instructions = environment.instructions(state, np.arange(batch))
+    keypoints = (np.asarray(environment.keypoints(state)) + noise).astype(np.float32)
+    latched = np.zeros(keypoints.shape[:2], np.int32)
+    seen: list[list[np.ndarray]] = [[] for _ in range(batch)]
+    answers: list[list[str]] = [[] for _ in range(batch)]
+    targets: list[list[np.ndarray]] = [[] for _ in range(batch)]
+    over = has_ended(state)
+    for done in range(1, (limit or environment.keyframe_limit(state)) + 1):
+        if over.all():
+            break
+        observation = environment.observe(state)
+        latched = np.asarray(jax.vmap(advance_latch)(latched, observation.pose[..., :3], keypoints))
+        active = np.asarray(jax.vmap(jax.vmap(active_keypoint))(latched, keypoints))
+        action, texts = act(observation, instructions, active)
+        rgb, positions = np.asarray(observation.rgb), np.asarray(action.pose)[..., :3]
+        for i in np.flatnonzero(~over).tolist():
+            seen[i].append(rgb[i])
+            answers[i].append(texts[i])
+            targets[i].append(positions[i])
+        state = environment.execute(state, action)
+        over = has_ended(state)
+        on_keyframe(done, int(np.sum(environment.success(state))))
+    last, reasons = np.asarray(environment.observe(state).rgb), failure_reasons(environment, state)
+    return [
+        Ending(not reasons[i], reasons[i], len(seen[i]), instructions[i], answers[i], [*seen[i], last[i]], targets[i])
+        for i in range(batch)
+    ]
+
+
+def has_ended(state: SimState) -> np.ndarray:
+    """bool (B,): nothing that is still to come can change the outcome."""
+    return np.asarray(state.verdict.succeeded) | np.asarray(state.verdict.failed) | np.asarray(state.diverged)
+
+
+def failure_reasons(environment: Environment, state: SimState) -> list[str]:
+    """Why each of the B episodes has not succeeded, the gravest reason first; empty where it has."""
+    checks = {
+        "the simulation diverged": state.diverged,
+        "entered the fail zone": state.verdict.failed,
+        "took the wrong object": environment.took_wrong_object(state),
+        "a pose was out of reach": state.ik_failed,
+        "dropped the object": environment.dropped(state),
+    }
+    found = {reason: np.asarray(check) for reason, check in checks.items()}
+    succeeded = np.asarray(environment.success(state))
+    return [
+        "" if succeeded[i] else next((reason for reason, check in found.items() if check[i]), "time-out")
+        for i in range(len(succeeded))
+    ]

@@ -1,0 +1,84 @@
+"""The closed loop on the host with scripted policies: what ends an episode, and which reason is given."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dsvla_jax.rollout import run_episodes
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.types import Action
+
+EPISODES = 4
+
+
+@functools.cache
+def environment(task: str) -> Environment:
+    return Environment(task, image_size=32)
+
+
+def keys_of(task: str) -> jax.Array:
+    return episode_keys(11, "validation", task, 0, EPISODES)
+
+
+def follow(plan: Action):
+    """A policy that answers with the key poses of a plan (B, M, A, ...), then with the last of them."""
+    poses, grippers = np.asarray(plan.pose), np.asarray(plan.gripper_open)
+    steps = iter(range(10**6))
+
+    def act(observation, instructions, keypoints):
+        m = min(next(steps), poses.shape[1] - 1)
+        return Action(jnp.asarray(poses[:, m]), jnp.asarray(grippers[:, m])), [f"key pose {m}"] * len(instructions)
+
+    return act
+
+
+def plan_of(task: str) -> Action:
+    return environment(task).expert(environment(task).reset(keys_of(task)))
+
+
+def reasons(task: str, plan: Action) -> list[str]:
+    return [ending.reason for ending in run_episodes(environment(task), follow(plan), keys_of(task))]
+
+
+def test_an_episode_ends_with_its_success():
+    plan = plan_of("put_rubbish_in_bin")
+    endings = run_episodes(environment("put_rubbish_in_bin"), follow(plan), keys_of("put_rubbish_in_bin"))
+    for ending in endings:
+        assert ending.success
+        assert ending.reason == ""
+        assert ending.keyframes == plan.pose.shape[1] == len(ending.answers) == len(ending.targets)
+        assert len(ending.frames) == ending.keyframes + 1
+        assert "rubbish" in ending.instruction or "trash" in ending.instruction or "paper" in ending.instruction
+
+
+def test_each_failure_has_its_reason():
+    task = "put_rubbish_in_bin"
+    plan, start = plan_of(task), environment(task).reset(keys_of(task))
+    nothing = Action(plan.pose[:, :1], plan.gripper_open[:, :1])
+    assert reasons(task, nothing) == ["time-out"] * EPISODES
+
+    beyond = Action(plan.pose.at[..., 0].add(5.0), plan.gripper_open)
+    assert reasons(task, beyond) == ["a pose was out of reach"] * EPISODES
+
+    # The rubbish is let go of over the table.
+    dropped = Action(plan.pose[:, :3], plan.gripper_open[:, :3].at[:, 2].set(1.0))
+    assert reasons(task, dropped) == ["dropped the object"] * EPISODES
+
+    tomato = jax.vmap(lambda state: environment(task).view(state).body_pose("rubbish_tomato_left"))(start)
+    wrong = Action(plan.pose.at[:, :2, 0, :2].set(tomato[:, None, :2]), plan.gripper_open)
+    assert reasons(task, wrong) == ["took the wrong object"] * EPISODES
+
+
+def test_noise_moves_the_keypoints_that_the_policy_is_told():
+    told = []
+
+    def act(observation, instructions, keypoints):
+        told.append(keypoints)
+        return Action(observation.pose, observation.gripper_open), [""] * EPISODES
+
+    for noise in (0.0, 0.05):
+        run_episodes(environment("lamp_on"), act, keys_of("lamp_on"), limit=1, noise=noise)
+    np.testing.assert_allclose(told[1] - told[0], 0.05, atol=1e-6)
