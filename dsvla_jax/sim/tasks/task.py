@@ -223,6 +223,14 @@ def pointing_down(yaw: Array | float = 0.0) -> Array:
     return rotations.quaternion_multiply(turn, rotations.DOWN)
 
 
+def leaning(angle: float, yaw: Array | float = 0.0) -> Array:
+    """The quaternion (4,) of a gripper that comes along the y axis of a body turned by ``yaw``: straight down at angle
+    0, level along +y at pi / 2 and along -y at -pi / 2. Its fingers open in the vertical plane through that axis."""
+    lean = rotations.quaternion_from_axis_angle(jnp.array([1.0, 0.0, 0.0]), jnp.asarray(angle, jnp.float32))
+    turn = rotations.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(yaw, jnp.float32))
+    return rotations.quaternion_multiply(turn, rotations.quaternion_multiply(lean, rotations.DOWN))
+
+
 def yaw_of(pose: Array) -> Array:
     """How far (), in radians, a body's pose (7,) is turned about the vertical: the heading of its x axis."""
     x, y, _ = rotations.quaternion_rotate(pose[3:], jnp.array([1.0, 0.0, 0.0]))
