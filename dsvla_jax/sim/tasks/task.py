@@ -24,6 +24,7 @@ BOX = mujoco.mjtGeom.mjGEOM_BOX
 SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER  # to look at only: MJX has no cylinder-box contacts
+ELLIPSOID = mujoco.mjtGeom.mjGEOM_ELLIPSOID  # to look at only, as a cylinder
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
 INVISIBLE_GROUP = 3  # geoms of this group collide but are not drawn
