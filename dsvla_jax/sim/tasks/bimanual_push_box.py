@@ -25,7 +25,7 @@ def _build(spec) -> None:
     parcel = task.add_object(spec, "box", HEIGHT)
     card, tape = [0.72, 0.53, 0.32, 1], [0.87, 0.78, 0.6, 1]
     task.add_part(parcel, "box", task.BOX, [DEPTH, WIDTH, HEIGHT], [0, 0, 0], card, OBJECT, mass=1.5)
-    task.add_part(parcel, "box_tape", task.BOX, [0.015, WIDTH + 0.001, HEIGHT + 0.001], [0, 0, 0], tape)
+    task.add_part(parcel, "box_tape", task.BOX, [0.015, WIDTH + 0.001, HEIGHT + 0.001], [0, 0, 0], tape, mass=0)
     label = [0.03, 0.045, 0.002]
     task.add_part(parcel, "box_label", task.BOX, label, [0.05, -0.09, HEIGHT], [0.95, 0.95, 0.95, 1])
 
