@@ -72,6 +72,7 @@ OBJECT = CollisionBits(2, 3)  # free things: hit the table, the fingers and each
 OBJECT_AND_FIXTURE = CollisionBits(2, 11)  # a free thing that also hits fixtures
 FINGER = CollisionBits(4, 3)
 FIXTURE = CollisionBits(8, 4)  # doors, drawers, buttons: hit the fingers, never the table
+SURFACE = CollisionBits(8, 0)  # what things are laid on: hits OBJECT_AND_FIXTURE, and spares the fingers' contacts
 VISUAL = CollisionBits(0, 0)
 
 _LINK_MASSES = (4.970684, 0.646926, 3.228604, 3.587895, 1.225946, 1.666555, 0.735522)
