@@ -5,6 +5,7 @@ config, the vocabulary, checkpoints, and metrics (metrics.jsonl and TensorBoard)
 """
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -48,6 +49,7 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
         image_size=data.image_size,
         seed=data.seed,
         perturb=data.perturb,
+        workers=os.cpu_count() or 1,
     )
     reader = EpisodeReader(Path(data.folder), tasks=data.tasks, episodes=data.episodes)
     tokenizer = suite_tokenizer()

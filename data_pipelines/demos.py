@@ -1,15 +1,22 @@
 """Scripted-expert demonstrations: python -m data_pipelines.demos OUT --tasks lamp_on put_rubbish_in_bin --episodes 100
 
-Runs the tasks' scripted experts in C MuJoCo, keeps the episodes that the task itself counts as a success, and replaces
-the others by further seeds. Interrupted, it continues with the first missing shard; every shard depends only on the
-options and its own number, so the result is the same.
+Runs the tasks' scripted experts in C MuJoCo, several tasks at a time, and replaces the episodes that fail by further
+seeds. An episode is kept if it succeeded and if its recorded key poses, replayed from its seed, succeed too.
+Interrupted, it continues with the first missing shard; every shard depends only on the options and its own number, so
+the result is the same.
 """
 
+import contextlib
 import dataclasses
+import multiprocessing
+import os
+import queue
+import signal
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +30,9 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import get_task
+from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.types import Action, Array
 
 # Attempts, as a multiple of the episodes asked for, after which an expert counts as broken.
@@ -41,6 +49,8 @@ class Settings:
     image_size: int = 96
     """Rendered pixels a side."""
     seed: int = 0
+    split: Literal["train", "validation", "eval"] = "train"
+    """The stream of seeds; evaluations start from those of `eval`."""
     perturb: float = 0.03
     """Most metres an axis by which the arms miss a key pose, so that observations off the expert's path are recorded,
     with the expert's next key pose as the target."""
@@ -57,9 +67,11 @@ class Options(Settings):
     out: tyro.conf.Positional[Path] = dataclasses.field(kw_only=True)
     """The folder to write; a folder with the same options is continued."""
     tasks: tuple[str, ...] = dataclasses.field(kw_only=True)
-    """Names of tasks."""
+    """Names of tasks, all, single_arm or dual_arm."""
     episodes: int = 100
     """Successful demonstrations a task."""
+    workers: int = os.cpu_count() or 1
+    """Processes, each at work on one task."""
 
 
 class ScriptedExpert:
@@ -72,9 +84,10 @@ class ScriptedExpert:
         self._replay_latch = jax.jit(jax.vmap(replay_latch))
 
     def __call__(self, start: int, count: int) -> list[Episode | None]:
-        """Episodes start .. start + count - 1 of the training stream; None where the expert did not succeed."""
+        """Episodes start .. start + count - 1 of the stream of seeds; None where the expert did not succeed."""
         environment, settings = self.environment, self.settings
-        state = environment.reset(episode_keys(settings.seed, "train", self.task.name, start, count))
+        start_state = environment.reset(episode_keys(settings.seed, settings.split, self.task.name, start, count))
+        state = start_state
         keypoints = np.asarray(environment.keypoints(state))
         plan = environment.expert(state)
         poses, grippers = np.asarray(plan.pose), np.asarray(plan.gripper_open)  # (B, M, A, 7), (B, M, A)
@@ -93,6 +106,7 @@ class ScriptedExpert:
             state = environment.execute(
                 state, Action(pose=jnp.asarray(missed[:, m]), gripper_open=jnp.asarray(grippers[:, m]))
             )
+        replayed = self._replay(start_state, plan)
         positions = np.stack([observation.pose[..., :3] for observation in observations], axis=1)
         active = np.asarray(self._replay_latch(positions, keypoints))
         good = np.asarray(environment.success(state)) & ~np.asarray(state.ik_failed) & ~np.asarray(state.diverged)
@@ -101,7 +115,7 @@ class ScriptedExpert:
         for i in range(count):
             # Nobody acts after success, so nothing is recorded after it.
             frames = int(np.sum([running[i] for running in before_success]))
-            if not good[i] or frames == 0:
+            if not good[i] or frames == 0 or not replayed[i, frames]:
                 episodes.append(None)
                 continue
             seen = [jax.tree.map(lambda x, i=i: x[i], observation) for observation in observations[:frames]]
@@ -123,6 +137,14 @@ class ScriptedExpert:
                 )
             )
         return episodes
+
+    def _replay(self, state: SimState, plan: Action) -> np.ndarray:
+        """bool (B, M + 1): success after so many key poses of the plan, none of them missed."""
+        success = [np.asarray(self.environment.success(state))]
+        for m in range(plan.pose.shape[1]):
+            state = self.environment.execute(state, Action(plan.pose[:, m], plan.gripper_open[:, m]))
+            success.append(np.asarray(self.environment.success(state)))
+        return np.stack(success, axis=1)
 
     def _misses(self, rng: np.random.Generator, frames: int) -> np.ndarray:
         """How far each key pose is missed, float (M, 1, 3) metres.
@@ -158,49 +180,135 @@ def generate_demonstrations(
     episodes: int = 100,
     *,
     demonstrator: Callable[[str, Settings], Demonstrate] = ScriptedExpert,
+    workers: int = 1,
     progress: bool = True,
     **settings: Any,
 ) -> None:
     """Makes sure that the folder holds at least `episodes` successful demonstrations of every task.
 
-    For one process a folder. What is there already with the same settings (fields of `Settings`) is kept; other
+    For one caller a folder. What is there already with the same settings (fields of `Settings`) is kept; other
     settings raise DataError.
     demonstrator: (task name, settings) -> the function that attempts episodes; made only when something is missing.
+    workers: processes at work on a task each; 1 works in this one.
     """
     wanted = Settings(**settings)
     folder = Path(folder)
     entries = {entry["file"]: entry for entry in existing_shards(folder, wanted)}
+    missing = [task for task in tasks if not is_complete(folder, task, episodes, entries)]
     made, attempts = 0, 0
     with tqdm(total=episodes * len(tasks), desc="demonstrations", unit="episode", disable=not progress) as bar:
-        for task in tasks:
-            kept, number, demonstrate = 0, 0, None
-            while kept < episodes:
-                name = f"{task}-{number:05d}.array_record"
-                entry = entries.get(name)
-                too_short = entry is not None and entry["cut"] and kept + len(entry["frames"]) < episodes
-                if entry is None or too_short or is_missing(folder, entry):
-                    if demonstrate is None:
-                        bar.set_postfix_str(f"{task}: the first batch compiles")
-                        demonstrate = demonstrator(task, wanted)
-                    good = [x for x in demonstrate(number * wanted.batch, wanted.batch) if x is not None]
-                    chosen = good[: episodes - kept]
-                    entry = write_shard(folder, name, task, chosen, cut=len(chosen) < len(good))
-                    entries[name] = entry
-                    write_index(folder, [entries[key] for key in sorted(entries)], dataclasses.asdict(wanted))
-                    made, attempts = made + len(good), attempts + wanted.batch
-                    bar.set_postfix_str(task)
-                bar.update(min(len(entry["frames"]), episodes - kept))
-                kept += len(entry["frames"])
-                number += 1
-                if kept < episodes and number * wanted.batch >= MAX_ATTEMPTS * max(episodes, wanted.batch):
-                    raise UserError(
-                        f"{task}: expected {episodes} successes of the scripted expert, got {kept} in"
-                        f" {number * wanted.batch} attempts; lower `perturb`, or correct the task's expert"
-                    )
+        bar.update(episodes * (len(tasks) - len(missing)))
+
+        def keep(entry: dict[str, Any], successes: int, tried: int) -> None:
+            nonlocal made, attempts
+            made, attempts = made + successes, attempts + tried
+            if tried:
+                entries[entry["file"]] = entry
+                write_index(folder, [entries[key] for key in sorted(entries)], dataclasses.asdict(wanted))
+            bar.set_postfix_str(entry["task"])
+            bar.update(len(entry["frames"]))
+
+        jobs = [(folder, task, episodes, wanted, entries, demonstrator) for task in missing]
+        bar.set_postfix_str("the first batch of each task compiles" if jobs else "")
+        if workers > 1 and len(jobs) > 1:
+            _complete_in_processes(jobs, min(workers, len(jobs)), keep)
+        else:
+            for job in jobs:
+                complete_task(*job, keep)
     if attempts:
         size = sum(entry["bytes"] for entry in entries.values()) / 1e6
         rate = f"the experts succeeded in {made} of {attempts} attempts"
         tqdm.write(f"{folder}: {episodes} demonstrations each of {', '.join(tasks)}; {rate}; {size:.0f} MB in all")
+
+
+def complete_task(
+    folder: Path,
+    task: str,
+    episodes: int,
+    wanted: Settings,
+    entries: Mapping[str, dict[str, Any]],
+    demonstrator: Callable[[str, Settings], Demonstrate],
+    keep: Callable[[dict[str, Any], int, int], None],
+) -> None:
+    """Writes the missing shards of one task. keep(index entry, successes, attempts) is told of each shard, old or new;
+    an old one took no attempts."""
+    kept, number, demonstrate = 0, 0, None
+    while kept < episodes:
+        name = shard_name(task, number)
+        entry, successes, attempts = entries.get(name), 0, 0
+        if entry is None or not is_usable(folder, entry, episodes - kept):
+            demonstrate = demonstrate or demonstrator(task, wanted)
+            good = [x for x in demonstrate(number * wanted.batch, wanted.batch) if x is not None]
+            chosen = good[: episodes - kept]
+            entry = write_shard(folder, name, task, chosen, cut=len(chosen) < len(good))
+            successes, attempts = len(good), wanted.batch
+        keep(entry, successes, attempts)
+        kept += len(entry["frames"])
+        number += 1
+        if kept < episodes and number * wanted.batch >= MAX_ATTEMPTS * max(episodes, wanted.batch):
+            raise UserError(
+                f"{task}: expected {episodes} successes of the scripted expert, got {kept} in"
+                f" {number * wanted.batch} attempts; lower `perturb`, or correct the task's expert"
+            )
+
+
+def _complete_in_processes(
+    jobs: Sequence[tuple[Any, ...]], workers: int, keep: Callable[[dict[str, Any], int, int], None]
+) -> None:
+    """Does the jobs (arguments of `complete_task` but for the last) in other processes; keep is called in this one."""
+    # Not forked: JAX has threads of its own.
+    context = multiprocessing.get_context("spawn")
+    with context.Manager() as manager, ProcessPoolExecutor(workers, context, _start_worker) as pool:
+        finished = manager.Queue()
+        waiting = [pool.submit(_complete_and_tell, job, finished) for job in jobs]
+        try:
+            while waiting or not finished.empty():
+                with contextlib.suppress(queue.Empty):
+                    keep(*finished.get(timeout=0.2))
+                for future in [future for future in waiting if future.done()]:
+                    waiting.remove(future)
+                    future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _start_worker() -> None:
+    # An interrupt is for the first process, which ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    configure_jax()
+
+
+def _complete_and_tell(job: tuple[Any, ...], finished: Any) -> None:
+    complete_task(*job, keep=lambda *shard: finished.put(shard))
+
+
+def shard_name(task: str, number: int) -> str:
+    """The file of a task's shard."""
+    return f"{task}-{number:05d}.array_record"
+
+
+def is_complete(folder: Path, task: str, episodes: int, entries: Mapping[str, dict[str, Any]]) -> bool:
+    """Whether so many episodes of the task are there."""
+    kept, number = 0, 0
+    while kept < episodes:
+        entry = entries.get(shard_name(task, number))
+        if entry is None or not is_usable(folder, entry, episodes - kept):
+            return False
+        kept += len(entry["frames"])
+        number += 1
+    return True
+
+
+def is_usable(folder: Path, entry: dict[str, Any], needed: int) -> bool:
+    """Whether a shard of the index is there and, if it was cut short when fewer episodes were asked for, long enough.
+    Raises DataError for one that is there but damaged: nobody's file is overwritten unasked."""
+    if (entry["cut"] and len(entry["frames"]) < needed) or not (folder / entry["file"]).exists():
+        return False
+    check_shard(folder, entry, digest=True)
+    return True
 
 
 def existing_shards(folder: Path, wanted: Settings) -> list[dict[str, Any]]:
@@ -215,21 +323,11 @@ def existing_shards(folder: Path, wanted: Settings) -> list[dict[str, Any]]:
     return index["shards"]
 
 
-def is_missing(folder: Path, entry: dict[str, Any]) -> bool:
-    """Whether a shard of the index is gone. Raises DataError for one that is there but damaged: nobody's file is
-    overwritten unasked."""
-    if not (folder / entry["file"]).exists():
-        return True
-    check_shard(folder, entry, digest=True)
-    return False
-
-
 def main(options: Options) -> None:
     """Generates what the options ask for."""
-    for task in options.tasks:
-        get_task(task)  # a misspelt name is told before the work for the others
+    tasks = select_tasks(options.tasks)
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(Settings)}
-    generate_demonstrations(options.out, options.tasks, options.episodes, **settings)
+    generate_demonstrations(options.out, tasks, options.episodes, workers=options.workers, **settings)
 
 
 if __name__ == "__main__":

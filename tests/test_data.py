@@ -318,6 +318,17 @@ def test_generation_replaces_failures_and_is_deterministic(tmp_path):
     assert len(reader) == 10
 
 
+def fake_expert(task, settings):
+    return FakeExpert()(task, settings)
+
+
+def test_processes_make_the_same_files(tmp_path):
+    tasks = ["lamp_on", "close_fridge"]
+    for folder, workers in ((tmp_path / "one", 1), (tmp_path / "two", 2)):
+        generate_demonstrations(folder, tasks, 8, demonstrator=fake_expert, workers=workers, batch=4, progress=False)
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
 def test_interrupted_generation_continues_where_it_stopped(tmp_path):
     tasks = ["lamp_on", "close_fridge"]
     whole, parts = tmp_path / "whole", tmp_path / "parts"

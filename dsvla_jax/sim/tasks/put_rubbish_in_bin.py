@@ -98,6 +98,9 @@ TASK = task.Task(
     keypoints=_keypoints,
     success=_success,
     expert=_expert,
-    graspables=(task.Graspable("rubbish", (RUBBISH,) * 3), *(task.Graspable(o, (TOMATO,) * 3) for o in OBJECTS[1:])),
+    graspables=(
+        task.Graspable("rubbish", (RUBBISH, RUBBISH, RUBBISH)),
+        *(task.Graspable(name, (TOMATO, TOMATO, TOMATO)) for name in OBJECTS[1:]),
+    ),
     targets=lambda view: jnp.array([True, False, False]),
 )
