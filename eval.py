@@ -20,7 +20,6 @@ from tqdm import tqdm
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.compile_times import first_use
 from dsvla_jax.errors import UserError
-from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.policy import Policy, load_policy
 from dsvla_jax.report import (
     EpisodeResult,
@@ -35,9 +34,9 @@ from dsvla_jax.report import (
 from dsvla_jax.rollout import Ending, run_episodes
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.shifts import check_shifts
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, load_experiment
-from dsvla_jax.types import Camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +55,8 @@ class Options:
     """Most episodes side by side."""
     keypoint_noise: float = 0.0
     """Metres of uniform noise an axis on every keypoint (paper, section 4.3: up to 0.1)."""
+    shift: tuple[str, ...] = ()
+    """Test conditions unlike those of training (paper, Table 4): instance, position, background, camera."""
     seed: int = 0
     skip_finished: bool = False
     """Leave the tasks as they are that have been evaluated since the last training."""
@@ -82,7 +83,7 @@ def main(options: Options) -> None:
         policy = load_policy(options.run)
         for name in missing:
             endings = evaluate_task(policy, experiment, name, episodes, options)
-            save_strips(file, name, endings, front_camera(experiment.data.image_size))
+            save_strips(file, name, endings)
             results = results + [
                 EpisodeResult(name, i, options.physics, e.success, e.reason, e.keyframes, e.instruction, e.answers)
                 for i, e in enumerate(endings)
@@ -102,8 +103,9 @@ def main(options: Options) -> None:
 def results_file(run: Path, options: Options) -> Path:
     """Where the results of these conditions are kept; the physics alone name the plain ones."""
     noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
+    shifts = "".join(f"-{name}" for name in check_shifts(options.shift))
     seed = f"-seed-{options.seed}" if options.seed else ""
-    return run / "eval" / f"{options.physics}{noise}{seed}.jsonl"
+    return run / "eval" / f"{options.physics}{noise}{shifts}{seed}.jsonl"
 
 
 def other_physics(physics: str) -> str:
@@ -122,7 +124,9 @@ def finished_results(file: Path, run: Path, episodes: int) -> list[EpisodeResult
 
 def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: int, options: Options) -> list[Ending]:
     """All episodes of one task, ``options.batch`` of them side by side."""
-    environment = Environment(name, physics=options.physics, image_size=experiment.data.image_size)
+    environment = Environment(
+        name, physics=options.physics, image_size=experiment.data.image_size, shifts=options.shift
+    )
     size = min(episodes, options.batch)
     endings: list[Ending] = []
     with tqdm(total=episodes, desc=f"{name} ({options.physics})", unit="episode") as bar:
@@ -146,12 +150,12 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
     return endings[:episodes]
 
 
-def save_strips(file: Path, task: str, endings: Sequence[Ending], camera: Camera) -> None:
+def save_strips(file: Path, task: str, endings: Sequence[Ending]) -> None:
     """Writes the film strip of every episode beside the results, each target marked in the frame it was answered to."""
     folder = file.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
     for i, ending in enumerate(endings):
-        marked = [mark_targets(f, t, camera) for f, t in zip(ending.frames, ending.targets, strict=False)]
+        marked = [mark_targets(f, t, ending.camera) for f, t in zip(ending.frames, ending.targets, strict=False)]
         cv2.imwrite(str(folder / f"{task}-{i}.png"), film_strip([*marked, ending.frames[-1]])[..., ::-1])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
-from dsvla_jax.types import Action, Array, Observation
+from dsvla_jax.types import Action, Array, Camera, Observation
 
 Act = Callable[[Observation, Sequence[str], np.ndarray], tuple[Action, Sequence[str]]]
 
@@ -22,7 +22,7 @@ class Ending:
     """One finished episode.
 
     reason: why it failed, empty on success. keyframes: key poses executed. answers: the policy's text for each.
-    frames: uint8 (H, W, 3), what the policy saw before each key pose, and the last view.
+    frames: uint8 (H, W, 3), what the policy saw before each key pose, and the last view. camera: of the frames.
     targets: float32 (A, 3), the position that it answered to each frame but the last.
     """
 
@@ -32,6 +32,7 @@ class Ending:
     instruction: str
     answers: list[str]
     frames: list[np.ndarray]
+    camera: Camera
     targets: list[np.ndarray]
 
 
@@ -75,7 +76,16 @@ def run_episodes(
         on_keyframe(done, int(np.sum(environment.success(state))))
     last, reasons = np.asarray(environment.observe(state).rgb), failure_reasons(environment, state)
     return [
-        Ending(not reasons[i], reasons[i], len(seen[i]), instructions[i], answers[i], [*seen[i], last[i]], targets[i])
+        Ending(
+            success=not reasons[i],
+            reason=reasons[i],
+            keyframes=len(seen[i]),
+            instruction=instructions[i],
+            answers=answers[i],
+            frames=[*seen[i], last[i]],
+            camera=jax.tree.map(lambda x, i=i: x[i], state.camera),
+            targets=targets[i],
+        )
         for i in range(batch)
     ]
 

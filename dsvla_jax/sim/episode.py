@@ -1,7 +1,7 @@
 """Episodes of one task, B at a time: reset, observe, execute a key pose, judge."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import jax
@@ -13,8 +13,9 @@ from dsvla_jax.sim import controller, raycast
 from dsvla_jax.sim import physics as physics_module
 from dsvla_jax.sim.physics import SimState, Verdict
 from dsvla_jax.sim.scene import build_scene
+from dsvla_jax.sim.shifts import Start, check_shifts, shift
 from dsvla_jax.sim.tasks import StateView, Task, get_task
-from dsvla_jax.types import Action, Array, Observation
+from dsvla_jax.types import Action, Array, Camera, Observation
 
 # A pose that no arm reaches: an action that cannot be planned leaves the arms still.
 _OUT_OF_REACH = np.array([0.0, 0.0, 100.0, 0.0, 1.0, 0.0, 0.0], np.float32)
@@ -33,6 +34,7 @@ class Environment:
     task: a Task or its name. physics: "mujoco" (C, for CPUs) or "mjx" (accelerators, jitted throughout).
     image_size: height and width of the front camera's picture, pixels.
     num_arms: only checked against the task's, for a caller that needs a certain number.
+    shifts: which of ``shifts.SHIFTS`` make the episodes unlike those of training.
     """
 
     def __init__(
@@ -42,11 +44,13 @@ class Environment:
         image_size: int = 96,
         num_arms: int | None = None,
         shadows: bool = True,
+        shifts: Sequence[str] = (),
     ):
         self.task = get_task(task) if isinstance(task, str) else task
         if num_arms is not None and num_arms != self.task.num_arms:
             raise ValueError(f"task {self.task.name!r} is for {self.task.num_arms} arm(s), not {num_arms}")
-        self.scene = build_scene(self.task)
+        self.shifts = check_shifts(shifts)
+        self.scene = build_scene(self.task, clutter="background" in self.shifts)
         self.num_arms = self.task.num_arms
         self.image_size = image_size
         self.camera = front_camera(image_size)
@@ -59,18 +63,18 @@ class Environment:
         self._centres = np.array([g.centre for g in graspables], np.float32).reshape(-1, 3)
         self._judge = self._judge_one  # one object, as it is a key of compiled programs
 
-        self._place = jax.jit(jax.vmap(lambda key, variation: self.scene.place(self.task.sample(key, variation))))
-        self._render = jax.jit(jax.vmap(self._render_one))
+        self._begin = jax.jit(jax.vmap(self._begin_one))
+        self._render = jax.jit(jax.vmap(self._render_one, in_axes=(0, 0, 0, *[0 if self.shifts else None] * 3)))
         self._end_effector = jax.jit(jax.vmap(lambda qpos: controller.end_effector(qpos, self._arms)))
         self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
         self._taken = jax.jit(jax.vmap(self._taken_one))
         self._expert = jax.jit(jax.vmap(lambda state: self.task.expert(self.view(state))))
         if physics == "mujoco":
-            stepper = physics_module.mujoco_stepper(self.scene.mj_model)
+            stepper = physics_module.mujoco_stepper(self.scene.mj_model, resize="instance" in self.shifts)
             plan, attach = jax.jit(jax.vmap(self._plan_one)), jax.jit(jax.vmap(self._attach_one))
             self._execute = self._execute_on(plan, stepper, attach)
         elif physics == "mjx":
-            stepper = physics_module.mjx_stepper(self.scene.mj_model)
+            stepper = physics_module.mjx_stepper(self.scene.mj_model, resize="instance" in self.shifts)
             jitted = physics_module.jit_with_mjx(self._execute_mjx(stepper))
             self._execute = lambda state, action: jitted(stepper.mjx_model, state, action)
         else:
@@ -88,13 +92,17 @@ class Environment:
         batch = len(keys)
         if variation is None:
             variation = self.variations(keys)
-        placed = self._place(keys, jnp.asarray(variation, jnp.int32))
-        state = physics_module.initial_state(self.scene.mj_model, batch).replace(
-            qpos=placed.qpos,
-            ctrl=placed.ctrl,
-            mocap_pos=placed.mocap_pos,
-            mocap_quat=placed.mocap_quat,
-            geom_rgba=placed.geom_rgba,
+        start = self._begin(keys, jnp.asarray(variation, jnp.int32))
+        state = physics_module.initial_state(self.scene.mj_model, batch, self.camera).replace(
+            qpos=start.scene.qpos,
+            ctrl=start.scene.ctrl,
+            mocap_pos=start.scene.mocap_pos,
+            mocap_quat=start.scene.mocap_quat,
+            geom_rgba=start.scene.geom_rgba,
+            geom_size=start.geom_size,
+            geom_pos=start.geom_pos,
+            camera=start.camera,
+            light=start.light,
             variation=jnp.asarray(variation, jnp.int32),
         )
         hold = Action(
@@ -125,12 +133,14 @@ class Environment:
         """What a policy sees of the B episodes; every field with the batch in front, the camera's too."""
         rgb, depth, _ = self.render(state)
         pose, gripper_open = self.end_effector(state)
-        camera = jax.tree.map(lambda x: jnp.broadcast_to(x, (rgb.shape[0], *x.shape)), self.camera)
-        return Observation(rgb=rgb, depth=depth, camera=camera, pose=pose, gripper_open=gripper_open)
+        return Observation(rgb=rgb, depth=depth, camera=state.camera, pose=pose, gripper_open=gripper_open)
 
     def render(self, state: SimState) -> tuple[Array, Array, Array]:
         """rgb uint8 (B, H, W, 3), depth float32 (B, H, W) metres, segmentation int32 (B, H, W), geom ids, -1 sky."""
-        return self._render(state.geom_xpos, state.geom_xmat, state.geom_rgba)
+        seen = (self._primitives.sizes, self.camera, self._primitives.light_direction)
+        if self.shifts:
+            seen = (state.geom_size, state.camera, state.light)
+        return self._render(state.geom_xpos, state.geom_xmat, state.geom_rgba, *seen)
 
     def success(self, state: SimState) -> Array:
         """bool (B,): the task's predicate has held at some physics step since reset, and no failure came before."""
@@ -167,6 +177,17 @@ class Environment:
     def end_effector(self, state: SimState) -> tuple[Array, Array]:
         """pose float32 (B, A, 7), gripper_open float32 (B, A)."""
         return self._end_effector(state.qpos)
+
+    def _begin_one(self, key: Array, variation: Array) -> Start:
+        model = self.scene.mj_model
+        start = Start(
+            scene=self.scene.place(self.task.sample(key, variation)),
+            camera=self.camera,
+            light=self._primitives.light_direction,
+            geom_size=jnp.asarray(model.geom_size, jnp.float32),
+            geom_pos=jnp.asarray(model.geom_pos, jnp.float32),
+        )
+        return shift(self.shifts, self.scene, jax.random.fold_in(key, 2), start)
 
     def _judge_one(self, state: SimState) -> Verdict:
         """The stages are passed one a step at most; success counts after the last of them."""
@@ -231,13 +252,15 @@ class Environment:
 
         return execute
 
-    def _render_one(self, geom_xpos: Array, geom_xmat: Array, geom_rgba: Array) -> tuple[Array, Array, Array]:
+    def _render_one(
+        self, geom_xpos: Array, geom_xmat: Array, geom_rgba: Array, geom_size: Array, camera: Camera, light: Array
+    ) -> tuple[Array, Array, Array]:
         return raycast.render(
-            self._primitives,
+            self._primitives.replace(sizes=geom_size, light_direction=light),
             geom_xpos,
             geom_xmat,
             geom_rgba,
-            self.camera,
+            camera,
             self.image_size,
             self.image_size,
             shadows=self._shadows,

@@ -12,8 +12,10 @@ eq_active in the state; of the other physical fields it may read only what does 
 variation).
 """
 
+import contextlib
 import copy
 import functools
+import io
 import os
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -25,7 +27,9 @@ import mujoco.rollout
 import numpy as np
 from flax import struct
 
-from dsvla_jax.types import Array
+from dsvla_jax.geometry.cameras import front_camera
+from dsvla_jax.sim import raycast
+from dsvla_jax.types import Array, Camera
 
 
 class Verdict(struct.PyTreeNode):
@@ -48,6 +52,9 @@ class SimState(struct.PyTreeNode):
     eq_active: bool (B, neq). eq_data: float32 (B, neq, mjNEQDATA); the rows of welds hold the relative pose.
     geom_xpos: float32 (B, ngeom, 3), geom_xmat: float32 (B, ngeom, 3, 3), world poses for the renderer.
     geom_rgba: float32 (B, ngeom, 4).
+    geom_size, geom_pos: float32 (B, ngeom, 3), in the bodies' frames; the model's own unless a stepper was made with
+        ``resize``.
+    camera: the B cameras that look on. light: float32 (B, 3), unit, the way that light travels in the world.
     verdict: Verdict. ik_failed: bool (B,), latched: some commanded pose was out of reach.
     grasped: bool (B, neq), latched: the welds that have ever held something.
     diverged: bool (B,), latched: the physics became non-finite, and the state is that of before the run.
@@ -64,6 +71,10 @@ class SimState(struct.PyTreeNode):
     geom_xpos: Array
     geom_xmat: Array
     geom_rgba: Array
+    geom_size: Array
+    geom_pos: Array
+    camera: Camera
+    light: Array
     verdict: Verdict
     grasped: Array
     ik_failed: Array
@@ -80,8 +91,8 @@ class Stepper(Protocol):
     ) -> SimState: ...
 
 
-def initial_state(model: mujoco.MjModel, batch: int) -> SimState:
-    """``batch`` copies of the model's reference configuration, at rest."""
+def initial_state(model: mujoco.MjModel, batch: int, camera: Camera | None = None) -> SimState:
+    """``batch`` copies of the model's reference configuration, at rest, seen by ``camera`` (of one example)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
 
@@ -100,6 +111,10 @@ def initial_state(model: mujoco.MjModel, batch: int) -> SimState:
         geom_xpos=tile(data.geom_xpos),
         geom_xmat=tile(data.geom_xmat.reshape(-1, 3, 3)),
         geom_rgba=tile(model.geom_rgba),
+        geom_size=tile(model.geom_size),
+        geom_pos=tile(model.geom_pos),
+        camera=jax.tree.map(tile, camera or front_camera(1)),
+        light=tile(raycast.light_direction()),
         verdict=Verdict(false, false, jnp.zeros(batch, jnp.int32)),
         grasped=jnp.zeros((batch, model.neq), bool),
         ik_failed=false,
@@ -121,8 +136,9 @@ def judge_steps(judge: Judge, state: SimState, qpos: Array, eq_active: Array) ->
 class MujocoStepper:
     """C MuJoCo in a pool of threads. Takes and returns arrays on the host; not for use under jit."""
 
-    def __init__(self, model: mujoco.MjModel, threads: int | None = None):
+    def __init__(self, model: mujoco.MjModel, threads: int | None = None, resize: bool = False):
         self.model = model
+        self._resize = resize
         self._threads = threads or min(2, os.cpu_count() or 1)
         self._pool = mujoco.rollout.Rollout(nthread=self._threads)
         self._data = [mujoco.MjData(model) for _ in range(self._threads)]
@@ -139,8 +155,7 @@ class MujocoStepper:
             raise ValueError(
                 f"controls: expected ({state.qpos.shape[0]}, steps, {model.nu}), got {tuple(controls.shape)}"
             )
-        while len(self._models) < batch:
-            self._models.append(copy.copy(model))
+        self._need_models(batch)
         eq_data, mocap_pos, mocap_quat = map(np.asarray, (state.eq_data, state.mocap_pos, state.mocap_quat))
         mocap_bodies = np.flatnonzero(model.body_mocapid >= 0)
         mocap_ids = model.body_mocapid[mocap_bodies]
@@ -149,6 +164,7 @@ class MujocoStepper:
             self._models[i].eq_data[:] = eq_data[i]
             self._models[i].body_pos[mocap_bodies] = mocap_pos[i, mocap_ids]
             self._models[i].body_quat[mocap_bodies] = mocap_quat[i, mocap_ids]
+        self._set_sizes(state)
         if eq_active is None:
             active = np.broadcast_to(np.asarray(state.eq_active)[:, None], (batch, steps, model.neq))
         else:
@@ -184,33 +200,56 @@ class MujocoStepper:
         )
         return self.update_geometry(state)
 
+    def _need_models(self, batch: int) -> None:
+        while len(self._models) < batch:
+            self._models.append(copy.copy(self.model))
+
+    def _set_sizes(self, state: SimState) -> None:
+        """Gives each episode's model its own sizes, and bounds around them."""
+        if not self._resize:
+            return
+        base, sizes, places = self.model, np.asarray(state.geom_size), np.asarray(state.geom_pos)
+        factors = np.max(sizes / np.where(base.geom_size > 0, base.geom_size, np.inf), axis=-1)
+        factors = np.where(factors > 0, factors, 1.0)  # a plane has no size of its own
+        for model, size, place, factor in zip(self._models[: len(sizes)], sizes, places, factors, strict=True):
+            model.geom_size[:], model.geom_pos[:] = size, place
+            model.geom_rbound[:] = base.geom_rbound * factor
+            model.geom_aabb[:, 3:] = base.geom_aabb[:, 3:] * factor[:, None]
+            # The middle phase bounds whole bodies, which grow less than twice.
+            model.bvh_aabb[:, 3:] = 2 * base.bvh_aabb[:, 3:]
+
     def update_geometry(self, state: SimState) -> SimState:
         """Sets geom_xpos and geom_xmat from qpos and the mocap poses."""
         model, data = self.model, self._data[0]
+        if self._resize:
+            self._need_models(len(state.qpos))
+            self._set_sizes(state)
         qpos, mocap_pos, mocap_quat = map(np.asarray, (state.qpos, state.mocap_pos, state.mocap_quat))
         batch = qpos.shape[0]
         positions = np.empty((batch, model.ngeom, 3), np.float32)
         matrices = np.empty((batch, model.ngeom, 9), np.float32)
         for i in range(batch):
             data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos[i], mocap_pos[i], mocap_quat[i]
-            mujoco.mj_kinematics(model, data)
+            mujoco.mj_kinematics(self._models[i] if self._resize else model, data)
             positions[i], matrices[i] = data.geom_xpos, data.geom_xmat
         return state.replace(geom_xpos=positions, geom_xmat=matrices.reshape(batch, model.ngeom, 3, 3))
 
 
-def mujoco_stepper(model: mujoco.MjModel, threads: int | None = None) -> MujocoStepper:
-    """The C stepper of ``model``; see the module's words for the signature."""
-    return MujocoStepper(model, threads)
+def mujoco_stepper(model: mujoco.MjModel, threads: int | None = None, resize: bool = False) -> MujocoStepper:
+    """The C stepper of ``model``; see the module's words for the signature. resize: episodes have their own sizes."""
+    return MujocoStepper(model, threads, resize)
 
 
 class MjxStepper:
     """MJX: pure, for use under ``jit_with_mjx``. ``mjx_model`` may be passed in as an argument of the enclosing jit, so
     that the model is not baked into the program as constants."""
 
-    def __init__(self, model: mujoco.MjModel):
-        from mujoco import mjx
+    def __init__(self, model: mujoco.MjModel, resize: bool = False):
+        # mjx prints that warp, an engine of its own for one vendor's cards, is not installed.
+        with contextlib.redirect_stdout(io.StringIO()):
+            from mujoco import mjx
 
-        self._mjx = mjx
+        self._mjx, self._resize = mjx, resize
         # MJX commits its arrays to a device; jit would compile again whenever they meet others that are not.
         self.mjx_model = _uncommitted(mjx.put_model(model, impl="jax"))
         self._template = _uncommitted(mjx.make_data(model, impl="jax"))
@@ -268,6 +307,8 @@ class MjxStepper:
     def _with_state(self, model: Any, state: SimState) -> Any:
         """The model of one episode: its welds, and its furniture where the mocap poses are. MJX moves a mocap body
         without the bodies that hang from it; those follow the model's own pose of the body."""
+        if self._resize:
+            model = model.replace(geom_size=state.geom_size, geom_pos=state.geom_pos)
         return model.replace(
             eq_data=state.eq_data,
             body_pos=model.body_pos.at[self._mocap_bodies].set(state.mocap_pos[self._mocap_ids]),
@@ -301,6 +342,6 @@ def jit_with_mjx(function: Callable[..., Any], **options: Any) -> Any:
     return jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": False} if affected else None, **options)
 
 
-def mjx_stepper(model: mujoco.MjModel) -> MjxStepper:
-    """The MJX stepper of ``model``; see the module's words for the signature."""
-    return MjxStepper(model)
+def mjx_stepper(model: mujoco.MjModel, resize: bool = False) -> MjxStepper:
+    """The MJX stepper of ``model``; see the module's words for the signature. resize: episodes have their own sizes."""
+    return MjxStepper(model, resize)

@@ -63,7 +63,13 @@ class Primitives:
     geom_types: tuple[int, ...] = struct.field(pytree_node=False)
 
 
-def primitives_from_model(model: mujoco.MjModel, light_direction=LIGHT_DIRECTION) -> Primitives:
+def light_direction() -> np.ndarray:
+    """float32 (3,), unit: the way that light usually travels in the world."""
+    direction = np.asarray(LIGHT_DIRECTION)
+    return (direction / np.linalg.norm(direction)).astype(np.float32)
+
+
+def primitives_from_model(model: mujoco.MjModel) -> Primitives:
     """The geoms of ``model`` a camera sees: alpha above zero and group below 3.
 
     Raises ValueError when a visible geom is a mesh, a height field or an SDF.
@@ -80,10 +86,9 @@ def primitives_from_model(model: mujoco.MjModel, light_direction=LIGHT_DIRECTION
                 "sphere, capsule, ellipsoid, cylinder or box, or hide it (group 3 or alpha 0)"
             )
         groups[kind].append(index)
-    light = np.asarray(light_direction, np.float64)
     return Primitives(
         sizes=jnp.asarray(model.geom_size, jnp.float32),
-        light_direction=jnp.asarray(light / np.linalg.norm(light), jnp.float32),
+        light_direction=jnp.asarray(light_direction()),
         groups=tuple((kind, tuple(members)) for kind, members in groups.items() if members),
         geom_types=tuple(int(kind) for kind in model.geom_type),
     )

@@ -15,6 +15,15 @@ from dsvla_jax.sim.tasks import Placement, StateLayout, StateView, Task
 from dsvla_jax.types import TABLE_HEIGHT, Array
 
 TABLE_RGBA = (0.62, 0.47, 0.34, 1.0)
+CLUTTER = "clutter"  # begins the names of things that stand about and are only looked at
+_CLUTTER_SHAPES = (
+    (mujoco.mjtGeom.mjGEOM_BOX, (0.03, 0.025, 0.05)),
+    (mujoco.mjtGeom.mjGEOM_SPHERE, (0.035, 0.0, 0.0)),
+    (mujoco.mjtGeom.mjGEOM_CYLINDER, (0.03, 0.06, 0.0)),
+    (mujoco.mjtGeom.mjGEOM_BOX, (0.05, 0.03, 0.015)),
+    (mujoco.mjtGeom.mjGEOM_CAPSULE, (0.02, 0.05, 0.0)),
+    (mujoco.mjtGeom.mjGEOM_CYLINDER, (0.045, 0.02, 0.0)),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +106,8 @@ class SceneState:
     geom_rgba: Array
 
 
-def build_scene(task: Task) -> Scene:
-    """Compiles the model of a task."""
+def build_scene(task: Task, clutter: bool = False) -> Scene:
+    """Compiles the model of a task. clutter: with things only to look at, out of sight until they are placed."""
     spec = mujoco.MjSpec()
     robot.set_physics_options(spec)
     spec.worldbody.add_geom(
@@ -117,6 +126,9 @@ def build_scene(task: Task) -> Scene:
     for prefix, base in zip(prefixes, bases, strict=True):
         robot.add_panda(spec, prefix, base)
     task.build(spec)
+    for i, (shape, size) in enumerate(_CLUTTER_SHAPES if clutter else ()):
+        body = spec.worldbody.add_body(name=f"{CLUTTER}{i}", mocap=True, pos=[0, 0, -1])
+        body.add_geom(name=f"{CLUTTER}{i}", type=shape, size=size, contype=0, conaffinity=0)
     for graspable in task.graspables:
         for prefix in prefixes:
             _add_weld(spec, f"{prefix}hand", graspable.body)

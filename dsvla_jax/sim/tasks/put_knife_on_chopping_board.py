@@ -58,7 +58,9 @@ def _build(spec) -> None:
         group=task.INVISIBLE_GROUP,
     )
     silver, low = [0.85, 0.87, 0.9, 1], 0.004 - HANDLE_RADIUS
-    task.add_part(knife, "knife_blade", task.BOX, [BLADE / 2 + 0.005, 0.015, 0.002], [-BLADE / 2 + 0.01, 0, low], silver)
+    task.add_part(
+        knife, "knife_blade", task.BOX, [BLADE / 2 + 0.005, 0.015, 0.002], [-BLADE / 2 + 0.01, 0, low], silver
+    )
 
 
 def _sample(key: Array, variation: Array) -> task.Placement:

@@ -102,5 +102,7 @@ TASK = task.Task(
         task.Graspable("rubbish", (RUBBISH, RUBBISH, RUBBISH)),
         *(task.Graspable(name, (TOMATO, TOMATO, TOMATO)) for name in OBJECTS[1:]),
     ),
+    resizable=OBJECTS,
+    colours_matter=True,
     targets=lambda view: jnp.array([True, False, False]),
 )

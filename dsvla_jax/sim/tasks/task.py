@@ -156,6 +156,8 @@ class Task:
     failure: view -> bool (): once it holds, the episode has failed for good.
     graspables: what a closing gripper attaches to. targets: view -> bool (N,), which of them it is right to take;
         None: all of them.
+    rests_on: loose body -> the body that it stands on or in, and moves with when their places are varied.
+    resizable: loose bodies that may have other sizes. colours_matter: whether they tell the objects apart.
     attachments: objects that ride on others. release: view -> bool (), judged after every keyframe: lets them go.
     """
 
@@ -173,6 +175,9 @@ class Task:
     failure: Callable[[StateView], Array] = never
     graspables: tuple[Graspable, ...] = ()
     targets: Callable[[StateView], Array] | None = None
+    rests_on: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    resizable: tuple[str, ...] = ()
+    colours_matter: bool = False
     attachments: tuple[Attachment, ...] = ()
     release: Callable[[StateView], Array] = never
 
