@@ -123,8 +123,9 @@ def half_pixel_shifted(camera: Camera) -> Camera:
 class OpenGLViews:
     """mujoco.Renderer looking through a ``Camera`` whose principal point is the middle of its square image."""
 
-    def __init__(self, model: mujoco.MjModel, size: int):
-        model.vis.quality.numslices = model.vis.quality.numstacks = 128  # finer than a pixel
+    def __init__(self, model: mujoco.MjModel, size: int, fine: bool = True):
+        if fine:  # facets smaller than a pixel
+            model.vis.quality.numslices = model.vis.quality.numstacks = 128
         self._renderer = mujoco.Renderer(model, size, size)
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0
