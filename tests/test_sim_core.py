@@ -1,5 +1,6 @@
 """The robot, its kinematics, the controller, both steppers and the episode, against MuJoCo and against physics."""
 
+import dataclasses
 import functools
 from typing import Literal
 
@@ -9,12 +10,19 @@ import mujoco
 import numpy as np
 import pytest
 
-from dsvla_jax.geometry.rotations import DOWN, quaternion_from_axis_angle, quaternion_multiply, rotation_distance
+from dsvla_jax.geometry.rotations import (
+    DOWN,
+    quaternion_from_axis_angle,
+    quaternion_from_wxyz,
+    quaternion_multiply,
+    rotation_distance,
+)
 from dsvla_jax.sim import controller, physics, robot
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.kinematics import forward_kinematics, inverse_kinematics
-from dsvla_jax.sim.tasks import Graspable, Placement, Task
-from dsvla_jax.sim.tasks.task import BOX, SPHERE, add_object, add_part, upright_pose
+from dsvla_jax.sim.scene import build_scene
+from dsvla_jax.sim.tasks import Graspable, Placement, StateView, Task
+from dsvla_jax.sim.tasks.task import BOX, HINGE, SLIDE, SPHERE, add_furniture, add_object, add_part, upright_pose
 from dsvla_jax.types import TABLE_HEIGHT, Action
 
 HALF = 0.0225
@@ -157,6 +165,36 @@ def test_key_poses_are_tracked(num_arms):
         assert np.linalg.norm((pose - action.pose)[..., :3], axis=-1).max() < 0.005
         assert rotation_distance(pose[..., 3:], action.pose[..., 3:]).max() < 0.02
         np.testing.assert_array_equal(gripper_open, action.gripper_open)
+
+
+def test_links_are_where_mujoco_puts_them():
+    def build(spec):
+        cabinet = add_furniture(spec, "cabinet")
+        drawer = cabinet.add_body(name="drawer", pos=[0.1, 0.02, 0.2], quat=[0.9, 0.1, 0.3, 0.2])
+        drawer.add_joint(name="drawer", type=SLIDE, axis=[1, 2, 0])
+        flap = drawer.add_body(name="flap", pos=[0.0, 0.1, 0.05])
+        flap.add_joint(name="flap", type=HINGE, axis=[0, 1, 1], pos=[0.03, -0.02, 0.01], ref=0.3)
+        cube = add_object(spec, "cube", HALF)
+        lid = cube.add_body(name="lid", pos=[0.0, 0.0, HALF])
+        lid.add_joint(name="lid", type=HINGE, axis=[0, 0, 1], pos=[HALF, 0, 0])
+        knob = lid.add_body(name="knob", pos=[0.01, 0.0, 0.01], quat=[0.5, 0.5, 0.5, 0.5])
+        for body in (drawer, flap, cube, lid, knob):
+            add_part(body, body.name, SPHERE, [0.01], [0, 0, 0], [1, 1, 1, 1])
+
+    scene = build_scene(dataclasses.replace(_cube_task(1), build=build))
+    turn = quaternion_from_axis_angle(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.7))
+    pose = jnp.concatenate([jnp.array([0.2, -0.1, 0.9]), turn])
+    joints = {"drawer": 0.07, "flap": -0.8, "lid": 1.1}
+    placed = scene.place(Placement(mocap={"cabinet": pose}, free={"cube": pose}, joints=joints))
+    data = mujoco.MjData(scene.mj_model)
+    data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = placed.qpos, placed.mocap_pos, placed.mocap_quat
+    mujoco.mj_kinematics(scene.mj_model, data)
+    nothing = jnp.zeros((1, 1), bool)
+    view = StateView(placed.qpos, placed.mocap_pos, placed.mocap_quat, nothing, jnp.int32(0), scene.layout)
+    for name in ("cabinet", "drawer", "flap", "cube", "lid", "knob"):
+        body, pose = data.body(name), view.body_pose(name)
+        np.testing.assert_allclose(pose[:3], body.xpos, atol=1e-6)
+        assert rotation_distance(pose[3:], quaternion_from_wxyz(jnp.asarray(body.xquat, jnp.float32))) < 1e-3
 
 
 def test_reset_is_seeded_settled_and_observable():

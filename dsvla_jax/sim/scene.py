@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -12,6 +13,7 @@ from dsvla_jax.geometry import rotations
 from dsvla_jax.sim import robot
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.tasks import Placement, StateLayout, StateView, Task
+from dsvla_jax.sim.tasks.task import Link, LinkJoint
 from dsvla_jax.types import TABLE_HEIGHT, Array
 
 TABLE_RGBA = (0.62, 0.47, 0.34, 1.0)
@@ -28,15 +30,14 @@ _CLUTTER_SHAPES = (
 
 @dataclass(frozen=True, eq=False)
 class GraspableBody:
-    """A loose object that a closing gripper is welded to.
+    """A body that a closing gripper is welded to.
 
-    body: body id. qpos: address of its free joint. half_extents, centre: float32 (3,), metres, in its frame.
+    body: body id. half_extents, centre: float32 (3,), metres, in its frame.
     welds: int (A,), the equality constraint to each arm's hand. They begin inactive; their anchor and relative pose
         (eq_data) are written when the object is grasped.
     """
 
     body: int
-    qpos: int
     half_extents: np.ndarray
     centre: np.ndarray
     welds: np.ndarray
@@ -146,7 +147,6 @@ def build_scene(task: Task, clutter: bool = False) -> Scene:
         graspables=tuple(
             GraspableBody(
                 body=model.body(g.body).id,
-                qpos=layout.address("free", g.body),
                 half_extents=np.asarray(g.half_extents, np.float32),
                 centre=np.asarray(g.centre, np.float32),
                 welds=np.array([model.equality(_weld_name(f"{prefix}hand", g.body)).id for prefix in prefixes]),
@@ -187,9 +187,35 @@ def _layout(model: mujoco.MjModel, arms: tuple[robot.Arm, ...], graspables: tupl
             free[model.body(joint.bodyid[0]).name] = int(joint.qposadr[0])
         elif not joint.name.startswith(prefixes):
             joints[joint.name] = int(joint.qposadr[0])
-    bodies = (model.body(i) for i in range(model.nbody))
+    bodies = [model.body(i) for i in range(model.nbody)]
     mocap = {body.name: int(body.mocapid[0]) for body in bodies if body.mocapid[0] >= 0}
-    return StateLayout(free=free, mocap=mocap, joints=joints, graspables=graspables, arms=arms)
+    links = {}
+    for body in bodies:  # parents come first
+        parent = bodies[body.parentid[0]].name
+        if parent in {*free, *mocap, *links}:
+            links[body.name] = _link(model, body, parent)
+    return StateLayout(free=free, mocap=mocap, joints=joints, links=links, graspables=graspables, arms=arms)
+
+
+def _link(model: mujoco.MjModel, body: Any, parent: str) -> Link:
+    w, x, y, z = body.quat.tolist()
+    joints = [model.joint(body.jntadr[0] + i) for i in range(body.jntnum[0])]
+    if any(joint.type[0] == mujoco.mjtJoint.mjJNT_BALL for joint in joints):
+        raise ValueError(f"body {body.name!r} has a ball joint; a StateView knows hinges and slides")
+    return Link(
+        parent=parent,
+        pose=(*body.pos.tolist(), x, y, z, w),
+        joints=tuple(
+            LinkJoint(
+                kind=joint.type[0],
+                address=int(joint.qposadr[0]),
+                axis=tuple(joint.axis.tolist()),
+                anchor=tuple(joint.pos.tolist()),
+                zero=float(joint.qpos0[0]),
+            )
+            for joint in joints
+        ),
+    )
 
 
 def _initial_state(model: mujoco.MjModel, arms: tuple[robot.Arm, ...]) -> SceneState:

@@ -33,12 +33,33 @@ OPEN, CLOSED = 1.0, 0.0
 
 
 @dataclasses.dataclass(frozen=True)
+class LinkJoint:
+    """A hinge or a slide. address: in qpos. axis, anchor: in its body's frame. zero: the value it was built at."""
+
+    kind: Any
+    address: int
+    axis: tuple[float, ...]
+    anchor: tuple[float, ...]
+    zero: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Link:
+    """A body that hangs on another one. pose: (7,), in the parent's frame as it was built. joints: in their order."""
+
+    parent: str
+    pose: tuple[float, ...]
+    joints: tuple[LinkJoint, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class StateLayout:
     """Where the named things of one model are: the static half of a `StateView`."""
 
     free: Mapping[str, int]  # body -> address of its free joint in qpos
     mocap: Mapping[str, int]  # body -> index into mocap_pos and mocap_quat
     joints: Mapping[str, int]  # hinge or slide joint -> address in qpos
+    links: Mapping[str, Link]  # bodies that hang on a loose body or on a piece of furniture
     graspables: tuple[str, ...]  # bodies, in the task's order
     arms: tuple[Arm, ...]  # the left one first; a single arm is called left
 
@@ -71,13 +92,31 @@ class StateView:
     layout: StateLayout = struct.field(pytree_node=False)
 
     def body_pose(self, name: str) -> Array:
-        """The world pose (7,), quaternion xyzw, of a loose object or of a piece of furniture (a mocap body)."""
+        """The world pose (7,), quaternion xyzw, of a loose object, of a piece of furniture (a mocap body) or of what
+        hangs on one of them."""
         if name in self.layout.mocap:
             i = self.layout.mocap[name]
             return jnp.concatenate([self.mocap_pos[i], rotations.quaternion_from_wxyz(self.mocap_quat[i])])
+        if name in self.layout.links:
+            return self._link_pose(self.layout.links[name])
         address = self.layout.address("free", name)
         pose = jax.lax.dynamic_slice_in_dim(self.qpos, address, 7)
         return jnp.concatenate([pose[:3], rotations.quaternion_from_wxyz(pose[3:])])
+
+    def _link_pose(self, link: Link) -> Array:
+        parent, local = self.body_pose(link.parent), jnp.asarray(link.pose, jnp.float32)
+        position = point_in_world(parent, local[:3])
+        turn = rotations.quaternion_multiply(parent[3:], local[3:])
+        for joint in link.joints:
+            axis, anchor = jnp.asarray(joint.axis, jnp.float32), jnp.asarray(joint.anchor, jnp.float32)
+            value = self.qpos[joint.address] - joint.zero
+            if joint.kind == SLIDE:
+                position = position + rotations.quaternion_rotate(turn, axis * value)
+                continue
+            pivot = position + rotations.quaternion_rotate(turn, anchor)
+            turn = rotations.quaternion_multiply(turn, rotations.quaternion_from_axis_angle(axis, value))
+            position = pivot - rotations.quaternion_rotate(turn, anchor)
+        return jnp.concatenate([position, turn])
 
     def joint(self, name: str) -> Array:
         """The value () of a hinge (radians) or a slide (metres)."""
@@ -112,7 +151,8 @@ class Placement:
 
 @dataclasses.dataclass(frozen=True)
 class Graspable:
-    """A loose object that a closing gripper attaches to, if the tool centre point is within 1 cm of its box.
+    """A loose object, or a link of one, that a closing gripper attaches to, if the tool centre point is within 1 cm of
+    its box.
 
     half_extents: metres. centre: of the box. Both in the body's frame.
     """
