@@ -100,7 +100,8 @@ def other_instance(scene: Scene, key: Array, start: Start) -> Start:
 
 def other_position(scene: Scene, key: Array, start: Start) -> Start:
     """Moves each body, with all that rests on it, by up to ``OFFSET`` along x and y."""
-    layout, carried = scene.layout, scene.task.rests_on
+    layout, task = scene.layout, scene.task
+    carried = {attachment.body: attachment.carrier for attachment in task.attachments} | dict(task.rests_on)
     qpos, places = start.scene.qpos, start.scene.mocap_pos
     roots = [name for name in (*layout.mocap, *layout.free) if name not in carried and not name.startswith(CLUTTER)]
     offsets = jax.random.uniform(key, (len(roots), 2), minval=-OFFSET, maxval=OFFSET)
