@@ -49,7 +49,7 @@ def run_expert(environment: Environment, keys: jax.Array, film: Path | None = No
     states = follow(environment, start, environment.expert(start))
     ends = {"expert": states[-1], "at reset": start, "idle": follow(environment, start, stay)[-1]}
     count = environment.task.variations
-    if count > 1:
+    if count > 1 and environment.task.exclusive:
         other = start.replace(variation=(start.variation + 1 + jnp.arange(len(keys)) % (count - 1)) % count)
         ends["wrong variation"] = follow(environment, start, environment.expert(other))[-1]
     if film:

@@ -192,6 +192,8 @@ class Task:
     expert: view at reset -> Action with a leading axis M: the key poses of a demonstration. A variation that needs
         fewer repeats the last one.
     variations: how many there are. words: variation -> what fills the braces of the instructions.
+    exclusive: whether acting out one variation never succeeds at another. Not so where they differ in looks, or in a
+        count of which more will do.
     stages: conditions that must have held before success counts, one after the other.
     failure: view -> bool (): once it holds, the episode has failed for good.
     graspables: what a closing gripper attaches to. targets: view -> bool (N,), which of them it is right to take;
@@ -211,6 +213,7 @@ class Task:
     expert: Callable[[StateView], Action]
     variations: int = 1
     words: Callable[[int], Mapping[str, str]] = lambda variation: {}
+    exclusive: bool = True
     stages: tuple[Callable[[StateView], Array], ...] = ()
     failure: Callable[[StateView], Array] = never
     graspables: tuple[Graspable, ...] = ()
