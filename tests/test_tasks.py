@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.expert_success import run_expert
+from benchmarks.expert_success import follow, run_expert
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.episode import Environment
@@ -66,6 +66,26 @@ def test_the_wrong_object_in_the_bin_is_no_success():
         pose[..., :3] += offset[:, None]
         state = environment.execute(state, Action(jnp.asarray(pose), plan.gripper_open[:, m]))
     assert not np.asarray(environment.success(state)).any()
+
+
+def test_a_tower_of_too_few_blocks_or_of_others_is_no_success():
+    environment = Environment("stack_blocks")
+    start = environment.reset(keys_of(environment)[:2], variation=jnp.full(2, 1))  # three blocks
+    fewer = environment.expert(start.replace(variation=jnp.zeros(2, jnp.int32)))  # two
+    others = start.replace(qpos=swapped_blocks(environment, np.array(start.qpos)))
+    for state, plan in ((start, fewer), (others, environment.expert(start))):
+        assert not np.asarray(environment.success(follow(environment, state, plan)[-1])).any()
+
+
+def swapped_blocks(environment: Environment, qpos: np.ndarray) -> np.ndarray:
+    """The blocks of the named colour and the others in each other's places."""
+    free = environment.scene.layout.free
+    for i in range(4):
+        target, other = (
+            slice(free[f"stack_{kind}{i}"], free[f"stack_{kind}{i}"] + 7) for kind in ("target", "distractor")
+        )
+        qpos[:, target], qpos[:, other] = qpos[:, other], qpos[:, target].copy()
+    return qpos
 
 
 def test_unknown_task_names_the_nearest():
