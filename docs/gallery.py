@@ -1,0 +1,107 @@
+"""Draws tasks and writes the page docs/tasks.md: python -m docs.gallery [--tasks lamp_on ...]
+
+--tasks: which pictures to draw (a minute each); the page always lists all tasks.
+"""
+
+import dataclasses
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from benchmarks.expert_success import follow
+from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.errors import UserError
+from dsvla_jax.report import film_strip
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.scene import build_scene
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.tasks import TASKS, StateView, Task, select_tasks
+
+SIZE, CANDIDATES = 224, 3  # pixels; episodes of which the first that succeeds is drawn
+DOCS = Path(__file__).parent
+GROUPS = {1: "Single-arm tasks", 2: "Dual-arm tasks"}
+INTRODUCTION = """# The tasks
+
+{count} tasks, named as in RLBench, built from primitive shapes. Each picture shows an episode at its start and when the
+scripted expert has succeeded, as the front camera sees it. Objects are placed at random; a task with variations also
+changes its colours, counts or places, and the instruction with them (the first variation is shown). Every task has
+three to five ways to say it. "Key poses" is how many the expert takes. [Adding a task](tasks_adding.md) takes one file.
+
+This page and its pictures are made by `python -m docs.gallery`.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which pictures to draw."""
+
+    tasks: tuple[str, ...] = ("all",)
+
+
+def draw(name: str) -> Path:
+    """An episode of the first variation at reset and after the expert's last key pose, side by side."""
+    environment = Environment(name, image_size=SIZE)
+    keys = episode_keys(1, "validation", name, 0, CANDIDATES)
+    start = environment.reset(keys, variation=jnp.zeros(CANDIDATES, jnp.int32))
+    states = follow(environment, start, environment.expert(start))
+    succeeded = np.asarray(environment.success(states[-1]))
+    if not succeeded.any():
+        raise UserError(
+            f"task {name!r}: its expert failed on all {CANDIDATES} episodes; see benchmarks.expert_success."
+        )
+    best = int(np.argmax(succeeded))
+    frames = [np.asarray(environment.observe(state).rgb[best]) for state in (states[0], states[-1])]
+    path = DOCS / "images" / "tasks" / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), film_strip(frames)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return path
+
+
+def number_of_key_poses(task: Task) -> int:
+    scene = build_scene(task)
+
+    def expert(key: jax.Array):
+        placed = scene.place(task.sample(key, jnp.int32(0)))
+        nothing = jnp.zeros((task.num_arms, len(task.graspables)), bool)
+        placement = (placed.qpos, placed.mocap_pos, placed.mocap_quat)
+        return task.expert(StateView(*placement, nothing, jnp.int32(0), scene.layout))
+
+    return jax.eval_shape(expert, jax.random.key(0)).pose.shape[0]
+
+
+def row(task: Task) -> str:
+    words = sys.modules[f"dsvla_jax.sim.tasks.{task.name}"].__doc__ or ""
+    meaning = re.sub(r"\s*RLBench[^:]*: \w+\.$", "", words.split("\n")[0])
+    picture = f"images/tasks/{task.name}.png"
+    shown = f"![{task.name}: at the start and at success]({picture})" if (DOCS / picture).exists() else ""
+    cells = (shown, f"`{task.name}`<br>{meaning}", f'"{task.say(0)}"', task.variations, number_of_key_poses(task))
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def write_page() -> Path:
+    parts = [INTRODUCTION.format(count=len(TASKS))]
+    for arms, title in GROUPS.items():
+        tasks = [task for _, task in sorted(TASKS.items()) if task.num_arms == arms]
+        table = ["| start, success | task | instruction | variations | key poses |", "|---|---|---|---:|---:|"]
+        parts.append("\n".join([f"## {title} ({len(tasks)})", "", *table, *map(row, tasks), ""]))
+    path = DOCS / "tasks.md"
+    path.write_text("\n".join(parts))
+    return path
+
+
+def main(options: Options) -> None:
+    configure_jax()
+    for name in select_tasks(options.tasks):
+        print(draw(name), flush=True)
+    print(write_page())
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        main(tyro.cli(Options, description=__doc__))
