@@ -55,9 +55,9 @@ def _sample(key: Array, variation: Array) -> task.Placement:
     low, high = jnp.array([0.1, -0.15, -jnp.pi]), jnp.array([0.24, 0.15, jnp.pi])
     x, y, yaw = jax.random.uniform(key, (3,), minval=low, maxval=high)
     root = task.upright_pose(x, y, TABLE_HEIGHT, yaw)
-    base, beside = task.point_in_world(root, (0.0, BASE, 0.0)), task.point_in_world(root, (0.0, BESIDE, END_RADIUS))
+    base, phone = task.point_in_world(root, (0.0, BASE, 0.0)), task.point_in_world(root, (0.0, BESIDE, END_RADIUS))
     return task.Placement(
-        mocap={"phone_base": task.upright_pose(*base, yaw)}, free={"phone": task.upright_pose(*beside, yaw)}
+        mocap={"phone_base": jnp.concatenate([base, root[3:]])}, free={"phone": jnp.concatenate([phone, root[3:]])}
     )
 
 

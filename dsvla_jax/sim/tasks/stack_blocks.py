@@ -55,7 +55,7 @@ def _sample(key: Array, variation: Array) -> task.Placement:
     return task.Placement(
         mocap={"stack_square": task.upright_pose(x, y, TABLE_HEIGHT, yaw)},
         free={
-            name: task.upright_pose(*place, TABLE_HEIGHT + HALF, turn)
+            name: task.upright_pose(place[0], place[1], TABLE_HEIGHT + HALF, turn)
             for name, place, turn in zip(TARGETS + DISTRACTORS, places, turns, strict=True)
         },
         rgba=dict.fromkeys(TARGETS, rgba[colour]) | dict.fromkeys(DISTRACTORS, rgba[other]),
