@@ -17,6 +17,7 @@ from dsvla_jax.sim.shifts import Start, check_shifts, shift
 from dsvla_jax.sim.tasks import StateView, Task, get_task
 from dsvla_jax.types import Action, Array, Camera, Observation
 
+MAX_RAYS = 2**21  # cast at once over all episodes: more need gigabytes
 # A pose that no arm reaches: an action that cannot be planned leaves the arms still.
 _OUT_OF_REACH = np.array([0.0, 0.0, 100.0, 0.0, 1.0, 0.0, 0.0], np.float32)
 
@@ -29,7 +30,7 @@ def _draw_variations(keys: Array, count: int) -> Array:
 
 class Environment:
     """A task in a simulator. It keeps compiled programs, never the state of an episode: every method is a function of
-    its arguments.
+    its arguments. With MJX, the pure ``execute_in_mjx(mjx_model, state, action)`` is there for larger jitted programs.
 
     task: a Task or its name. physics: "mujoco" (C, for CPUs) or "mjx" (accelerators, jitted throughout).
     image_size: height and width of the front camera's picture, pixels.
@@ -64,7 +65,7 @@ class Environment:
         self._judge = self._judge_one  # one object, as it is a key of compiled programs
 
         self._begin = jax.jit(jax.vmap(self._begin_one))
-        self._render = jax.jit(jax.vmap(self._render_one, in_axes=(0, 0, 0, *[0 if self.shifts else None] * 3)))
+        self._render = jax.jit(self._render_batch)
         self._end_effector = jax.jit(jax.vmap(lambda qpos: controller.end_effector(qpos, self._arms)))
         self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
         self._taken = jax.jit(jax.vmap(self._taken_one))
@@ -75,8 +76,9 @@ class Environment:
             self._execute = self._execute_on(plan, stepper, attach)
         elif physics == "mjx":
             stepper = physics_module.mjx_stepper(self.scene.mj_model, resize="instance" in self.shifts)
-            jitted = physics_module.jit_with_mjx(self._execute_mjx(stepper))
-            self._execute = lambda state, action: jitted(stepper.mjx_model, state, action)
+            self.mjx_model, self.execute_in_mjx = stepper.mjx_model, self._execute_mjx(stepper)
+            jitted = physics_module.jit_with_mjx(self.execute_in_mjx)
+            self._execute = lambda state, action: jitted(self.mjx_model, state, action)
         else:
             raise ValueError(f"physics: expected 'mujoco' or 'mjx', got {physics!r}")
 
@@ -252,16 +254,28 @@ class Environment:
 
         return execute
 
-    def _render_one(
+    def _render_batch(
         self, geom_xpos: Array, geom_xmat: Array, geom_rgba: Array, geom_size: Array, camera: Camera, light: Array
     ) -> tuple[Array, Array, Array]:
-        return raycast.render(
-            self._primitives.replace(sizes=geom_size, light_direction=light),
-            geom_xpos,
-            geom_xmat,
-            geom_rgba,
-            camera,
-            self.image_size,
-            self.image_size,
-            shadows=self._shadows,
+        """Sizes, camera and light are those of one example unless there are shifts."""
+        block = min(raycast.MAX_BLOCK_RAYS, MAX_RAYS // len(geom_xpos))
+
+        def one(
+            geom_xpos: Array, geom_xmat: Array, geom_rgba: Array, geom_size: Array, camera: Camera, light: Array
+        ) -> tuple[Array, Array, Array]:
+            return raycast.render(
+                self._primitives.replace(sizes=geom_size, light_direction=light),
+                geom_xpos,
+                geom_xmat,
+                geom_rgba,
+                camera,
+                self.image_size,
+                self.image_size,
+                shadows=self._shadows,
+                max_block_rays=block,
+            )
+
+        own = 0 if self.shifts else None
+        return jax.vmap(one, in_axes=(0, 0, 0, own, own, own))(
+            geom_xpos, geom_xmat, geom_rgba, geom_size, camera, light
         )

@@ -287,7 +287,7 @@ def pixel_directions(camera: Camera, height: int, width: int) -> Array:
     return jnp.einsum("ij,...j->...i", camera.world_from_camera[:3, :3], local, precision=jax.lax.Precision.HIGHEST)
 
 
-@functools.partial(jax.jit, static_argnames=("height", "width", "shadows", "far"))
+@functools.partial(jax.jit, static_argnames=("height", "width", "shadows", "far", "max_block_rays"))
 def render(
     primitives: Primitives,
     geom_xpos: Array,
@@ -298,17 +298,19 @@ def render(
     width: int,
     shadows: bool = True,
     far: float = FAR,
+    max_block_rays: int = MAX_BLOCK_RAYS,
 ) -> tuple[Array, Array, Array]:
     """One picture of the scene.
 
     geom_xpos float32 (Ng, 3) and geom_xmat float32 (Ng, 3, 3) (or (Ng, 9)): world poses of all geoms of the model.
+    max_block_rays: rows are cast in blocks of up to so many rays, one after the other, which bounds the memory.
     geom_rgba float32 (Ng, 4) in [0, 1]; a geom with alpha 0 is not drawn, any other alpha is opaque.
     Returns rgb uint8 (H, W, 3); depth float32 (H, W), planar metres, 0 where nothing is hit up to ``far``; and
     segmentation int32 (H, W), the geom id or -1 where nothing is hit. Surfaces beyond ``far`` keep colour and id.
     """
     xpos, rgba = jnp.asarray(geom_xpos, jnp.float32), jnp.asarray(geom_rgba, jnp.float32)
     xmat = jnp.asarray(geom_xmat, jnp.float32).reshape(-1, 3, 3)
-    rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * width <= MAX_BLOCK_RAYS))
+    rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * width <= max_block_rays))
     eye = jnp.asarray(camera.world_from_camera, jnp.float32)[:3, 3]
     directions = pixel_directions(camera, height, width).reshape(height // rows, rows * width, 3)
 
