@@ -30,6 +30,8 @@ class Options:
     tasks: tuple[str, ...] = ("all",)
     episodes: int = 100
     film: Path | None = None
+    shift: tuple[str, ...] = ()
+    """Test conditions (see dsvla_jax.sim.shifts) under which to look at the experts; no rate is required of them."""
 
 
 def follow(environment: Environment, state: SimState, plan: Action) -> list[SimState]:
@@ -65,7 +67,7 @@ def main(options: Options) -> int:
     short = False
     for name in select_tasks(options.tasks):
         # The validation stream: neither demonstrations nor evaluations use it.
-        environment = Environment(name, image_size=224 if options.film else 96)
+        environment = Environment(name, image_size=224 if options.film else 96, shifts=options.shift)
         outcome = run_expert(environment, episode_keys(0, "validation", name, 0, options.episodes), options.film)
         counts = {key: int(value.sum()) for key, value in outcome.items()}
         wrong = sum(count for key, count in counts.items() if key != "expert")
@@ -77,7 +79,7 @@ def main(options: Options) -> int:
             + (f"  failed seeds {failures[:10].tolist()}" if len(failures) else ""),
             flush=True,
         )
-    return int(short)
+    return int(short and not options.shift)
 
 
 if __name__ == "__main__":

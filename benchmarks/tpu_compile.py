@@ -73,7 +73,7 @@ def compile_keyframe(name: str, episodes: int, mesh: Mesh) -> dict[str, Any]:
         placed(environment.mjx_model, everywhere), placed(state, spread), placed(action, spread)
     )
     middle = time.perf_counter()
-    memory = lowered.compile().memory_analysis()
+    memory: Any = lowered.compile().memory_analysis()
     sizes = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
     return {
         "lower_seconds": round(middle - start, 1),

@@ -179,12 +179,12 @@ def test_links_are_where_mujoco_puts_them():
         lid.add_joint(name="lid", type=HINGE, axis=[0, 0, 1], pos=[HALF, 0, 0])
         knob = lid.add_body(name="knob", pos=[0.01, 0.0, 0.01], quat=[0.5, 0.5, 0.5, 0.5])
         for body in (drawer, flap, cube, lid, knob):
-            add_part(body, body.name, SPHERE, [0.01], [0, 0, 0], [1, 1, 1, 1])
+            add_part(body, body.name, SPHERE, [0.01], [0, 0, 0], [1, 1, 1, 1], mass=0.1)
 
     scene = build_scene(dataclasses.replace(_cube_task(1), build=build))
     turn = quaternion_from_axis_angle(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.7))
     pose = jnp.concatenate([jnp.array([0.2, -0.1, 0.9]), turn])
-    joints = {"drawer": 0.07, "flap": -0.8, "lid": 1.1}
+    joints = {name: jnp.float32(value) for name, value in (("drawer", 0.07), ("flap", -0.8), ("lid", 1.1))}
     placed = scene.place(Placement(mocap={"cabinet": pose}, free={"cube": pose}, joints=joints))
     data = mujoco.MjData(scene.mj_model)
     data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = placed.qpos, placed.mocap_pos, placed.mocap_quat

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.expert_success import follow, run_expert
+from benchmarks.robustness import torment
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import TASKS, get_task
+from dsvla_jax.sim.tasks import TASKS, colours, get_task
 from dsvla_jax.types import TABLE_HEIGHT, Action
 
 EPISODES = 8
@@ -87,6 +88,17 @@ def swapped_blocks(environment: Environment, qpos: np.ndarray) -> np.ndarray:
         )
         qpos[:, target], qpos[:, other] = qpos[:, other], qpos[:, target].copy()
     return qpos
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_colour_that_is_named_is_kept_where_colours_are_varied(name):
+    words = {word for text in TASKS[name].all_instructions() for word in text.split()}
+    assert TASKS[name].colours_matter or not words & {*colours.NAMES, "grey"}
+
+
+@pytest.mark.parametrize("name", ["put_rubbish_in_bin", "bimanual_lift_tray"])
+def test_hostile_actions_and_noise_leave_every_state_finite(name):
+    assert torment(name, keyframes=10) == []
 
 
 def test_unknown_task_names_the_nearest():

@@ -62,4 +62,5 @@ TASK = task.Task(
     keypoints=_keypoints,
     success=_success,
     expert=_expert,
+    resizable=("ball",),
 )

@@ -57,7 +57,9 @@ def _sample(key: Array, variation: Array) -> task.Placement:
     spot = jax.random.uniform(item_key, (2,), minval=-1.0) * jnp.array([0.04, 0.08])
     item = task.point_in_world(stand, jnp.append(spot, STAND + 2 * FLOOR + ITEM))
     tray = task.upright_pose(x, y, TABLE_HEIGHT + STAND + FLOOR, yaw)
-    return task.Placement(mocap={"stand": stand}, free={"tray": tray, "item": task.upright_pose(*item, yaw)})
+    return task.Placement(
+        mocap={"stand": stand}, free={"tray": tray, "item": task.upright_pose(item[0], item[1], item[2], yaw)}
+    )
 
 
 def _keypoints(view: task.StateView) -> Array:
@@ -100,4 +102,7 @@ TASK = task.Task(
     success=_success,
     expert=_expert,
     graspables=(task.Graspable("tray", (LENGTH, HANDLE + HANDLE_RADIUS, HANDLE_RADIUS)),),
+    rests_on={"tray": "stand", "item": "tray"},
+    resizable=("item",),
+    colours_matter=True,
 )

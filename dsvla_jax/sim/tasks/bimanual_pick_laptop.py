@@ -103,4 +103,5 @@ TASK = task.Task(
     success=_success,
     expert=_expert,
     graspables=(task.Graspable("laptop", BASE),),
+    rests_on={"laptop": "laptop_holder"},
 )

@@ -37,7 +37,7 @@ def _sample(key: Array, variation: Array) -> task.Placement:
     root = task.upright_pose(x, y, TABLE_HEIGHT, yaw)
     box, square = (task.point_in_world(root, (along, 0.0, 0.0)) for along in (PARCEL, SQUARE))
     return task.Placement(
-        mocap={"target": task.upright_pose(*square, yaw)},
+        mocap={"target": task.upright_pose(square[0], square[1], square[2], yaw)},
         free={"box": task.upright_pose(box[0], box[1], TABLE_HEIGHT + HEIGHT, yaw)},
     )
 
@@ -83,4 +83,5 @@ TASK = task.Task(
     keypoints=_keypoints,
     success=_success,
     expert=_expert,
+    colours_matter=True,
 )

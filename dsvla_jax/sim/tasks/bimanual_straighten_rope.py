@@ -62,7 +62,10 @@ def _sample(key: Array, variation: Array) -> task.Placement:
     bends = jnp.diff(headings)
     squares = [task.point_in_world(root, jnp.stack([aside * ASIDE, side, 0.0])) for side in (SPREAD, -SPREAD)]
     return task.Placement(
-        mocap={name: task.upright_pose(*square, yaw) for name, square in zip(TARGETS, squares, strict=True)},
+        mocap={
+            name: task.upright_pose(square[0], square[1], square[2], yaw)
+            for name, square in zip(TARGETS, squares, strict=True)
+        },
         free={ENDS[0]: task.upright_pose(tail[0], tail[1], TABLE_HEIGHT + RADIUS, yaw + headings[0])},
         joints={f"rope_joint{i + 1}": bends[i] for i in range(LINKS - 1)},
     )
@@ -121,4 +124,6 @@ TASK = task.Task(
     success=_success,
     expert=_expert,
     graspables=tuple(task.Graspable(end, (LENGTH / 2, RADIUS, RADIUS), HALF) for end in ENDS),
+    rests_on={TARGETS[1]: TARGETS[0]},  # the rope is as long as they are apart
+    colours_matter=True,
 )

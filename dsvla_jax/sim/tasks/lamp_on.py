@@ -74,4 +74,5 @@ TASK = task.Task(
     keypoints=_keypoints,
     success=_success,
     expert=_expert,
+    colours_matter=True,
 )

@@ -104,4 +104,5 @@ TASK = task.Task(
     success=_success,
     expert=_expert,
     graspables=(task.Graspable("phone", (0.04, HANDLE_RADIUS, HANDLE_RADIUS), (0.0, 0.0, HANDLE_RISE)),),
+    colours_matter=True,
 )

@@ -82,4 +82,5 @@ TASK = task.Task(
     keypoints=_keypoints,
     success=_success,
     expert=_expert,
+    colours_matter=True,
 )

@@ -154,4 +154,5 @@ TASK = task.Task(
     graspables=tuple(task.Graspable(name, (HALF, HALF, HALF)) for name in TARGETS + DISTRACTORS),
     targets=_targets,
     colours_matter=True,
+    rests_on=dict.fromkeys((*TARGETS[1:], *DISTRACTORS), TARGETS[0]),  # by themselves, they could collide
 )

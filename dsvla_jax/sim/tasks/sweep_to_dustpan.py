@@ -112,4 +112,5 @@ TASK = task.Task(
     graspables=(task.Graspable("broom", (HANDLE, HANDLE, 0.04), (0.0, 0.0, 0.2)),),
     attachments=(task.Attachment("broom", "broom_stand", (0.0, 0.0, HOVER)),),
     release=lambda view: view.holds("broom"),
+    resizable=DIRTS,
 )

@@ -74,7 +74,7 @@ def _success(view: task.StateView) -> Array:
 
 def _expert(view: task.StateView) -> Action:
     root, grip = view.body_pose("hanger"), _grip(view)
-    quaternion = rotations.quaternion_multiply(root[3:], ACROSS)
+    quaternion = rotations.quaternion_multiply(root[3:], jnp.array(ACROSS))
     out = task.point_in_world(root, (PULL, 0.0, 0.0)) - root[:3]
     down = jnp.array([0.0, 0.0, HALF + DROP - HANGS])
     positions = [grip + jnp.array([0.0, 0.0, APPROACH]), grip, grip + out, grip + out + down]

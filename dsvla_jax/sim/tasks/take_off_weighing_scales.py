@@ -106,4 +106,7 @@ TASK = task.Task(
     words=lambda variation: {"colour": list(COLOURS)[variation]},
     graspables=tuple(task.Graspable(name, (PEPPER, PEPPER, PEPPER)) for name in PEPPERS),
     targets=lambda view: jnp.arange(len(PEPPERS)) == view.variation,
+    rests_on=dict.fromkeys(PEPPERS, "scales"),
+    resizable=PEPPERS,
+    colours_matter=True,
 )

@@ -99,4 +99,5 @@ TASK = task.Task(
     graspables=(task.Graspable("usb", STICK_SIZE),),
     attachments=(task.Attachment("usb", "usb_computer", PLUGGED),),
     release=lambda view: view.holds("usb"),
+    colours_matter=True,
 )

@@ -17,7 +17,7 @@ from flax import struct
 
 from dsvla_jax.geometry import rotations
 from dsvla_jax.sim.kinematics import forward_kinematics
-from dsvla_jax.sim.robot import VISUAL, Arm, CollisionBits
+from dsvla_jax.sim.robot import VISUAL, Arm
 from dsvla_jax.types import TABLE_HEIGHT, Action, Array
 
 BOX = mujoco.mjtGeom.mjGEOM_BOX
@@ -198,8 +198,9 @@ class Task:
     failure: view -> bool (): once it holds, the episode has failed for good.
     graspables: what a closing gripper attaches to. targets: view -> bool (N,), which of them it is right to take;
         None: all of them.
-    rests_on: loose body -> the body that it stands on or in, and moves with when their places are varied.
-    resizable: loose bodies that may have other sizes. colours_matter: whether they tell the objects apart.
+    rests_on: body -> the body that it stands on or in, and moves with when their places are varied.
+    resizable: loose bodies that may have other sizes.
+    colours_matter: whether colours tell the objects apart or are named in the instructions.
     attachments: objects that ride on others. release: view -> bool (), judged after every keyframe: lets them go.
     """
 
@@ -236,10 +237,16 @@ class Task:
 
 
 def add_part(
-    body: Any, name: str, shape: Any, size: Any, pos: Any, rgba: Any, collision: CollisionBits = VISUAL, **more: Any
+    body: Any, name: str, shape: Any, size: Any, pos: Any, rgba: Any, collision: Any = VISUAL, **more: Any
 ) -> Any:
-    """Adds a geom to an MjsBody: half extents or (radius, half length) ``size``, metres. Only looked at by default."""
+    """Adds a geom to an MjsBody: half extents or (radius, half length) ``size``, metres.
+
+    By default it is only looked at and weighs nothing; ``collision``, a CollisionBits, makes it one that collides, of
+    ``mass`` kilograms.
+    """
     size = [*size, *[0.0] * (3 - len(size))]
+    if collision == VISUAL:
+        more = {"mass": 0.0, **more}
     bits = {"contype": collision.contype, "conaffinity": collision.conaffinity}
     return body.add_geom(name=name, type=shape, size=size, pos=list(pos), rgba=list(rgba), **bits, **more)
 

@@ -98,4 +98,5 @@ TASK = task.Task(
     graspables=(task.Graspable("charger", CHARGER_SIZE),),
     attachments=(task.Attachment("charger", "charger_board", PLUGGED),),
     release=lambda view: view.holds("charger"),
+    colours_matter=True,
 )

@@ -75,7 +75,7 @@ def _sample(key: Array, variation: Array) -> task.Placement:
         return pose.at[:3].set(task.point_in_world(pose, point))
 
     can = at(root, jnp.array([CAN, 0.0, 0.0]))
-    drops = {name: at(can, HEAD + offset) for name, offset in zip(DROPS, RING, strict=True)}
+    drops = {name: at(can, place) for name, place in zip(DROPS, HEAD + RING, strict=True)}
     return task.Placement(mocap={"plant": at(root, jnp.array([PLANT, 0.0, 0.0]))}, free={"waterer": can, **drops})
 
 
@@ -148,8 +148,8 @@ TASK = task.Task(
     stages=(_brought,),
     graspables=(task.Graspable("waterer", (BAR, HANDLE, HANDLE), (0.0, 0.0, HANDLE_TOP)),),
     attachments=tuple(
-        task.Attachment(name, "waterer", tuple(float(v) for v in HEAD + offset))
-        for name, offset in zip(DROPS, RING, strict=True)
+        task.Attachment(name, "waterer", (float(place[0]), float(place[1]), float(place[2])))
+        for name, place in zip(DROPS, HEAD + RING, strict=True)
     ),
     release=_pours,
 )
