@@ -4,6 +4,7 @@ CONFIG names a file of configs/. Demonstrations are generated first where they a
 config, the vocabulary, checkpoints, and metrics (metrics.jsonl and TensorBoard).
 """
 
+import dataclasses
 import json
 import os
 import sys
@@ -28,6 +29,7 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, load_policy, save_policy_config
+from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.sharding import batch_sharding, replicate
 from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
@@ -35,6 +37,8 @@ from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
 
 def main(experiment: Experiment, run: Path, resume: bool) -> None:
     """Trains one experiment into the run folder, or goes on from its newest checkpoint."""
+    tasks = select_tasks(experiment.data.tasks)
+    experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     prepare_run_folder(run, experiment, resume)
     checkpoints = RunCheckpoints(run)
     if checkpoints.latest_step == experiment.steps:

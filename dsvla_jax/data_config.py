@@ -9,6 +9,7 @@ class DataConfig:
 
     folder: str = "data/demos"
     tasks: tuple[str, ...] = ("lamp_on", "put_rubbish_in_bin", "close_fridge", "bimanual_lift_ball")
+    """Names of tasks, all, single_arm or dual_arm."""
     episodes: int = 100
     """Demonstrations a task."""
     image_size: int = 96

@@ -10,10 +10,13 @@ import pytest
 from configs import config_names, get_config
 from data_pipelines.episodes import Frame
 from data_pipelines.samples import make_sampler, suite_tokenizer
+from dsvla_jax.encoding.encode import build_prompt, encode_text
+from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step, model_inputs
 
@@ -104,3 +107,14 @@ def test_every_config_loads_and_a_typo_names_the_nearest():
         assert isinstance(get_config(name), Experiment)
     with pytest.raises(UserError, match="unknown config 'tiny_lore': did you mean 'tiny_lora'"):
         get_config("tiny_lore")
+
+
+def test_every_instruction_of_the_suite_fits_the_tiny_text():
+    encoding, tokenizer = get_config("tiny").encoding, suite_tokenizer()
+    for task in TASKS.values():
+        pose = np.tile(np.array([0.2, 0.1, 0.9, 0, 1, 0, 0], np.float32), (task.num_arms, 1))
+        gripper, keypoint = np.ones(task.num_arms, np.float32), np.zeros((task.num_arms, 3), np.float32)
+        answer = format_answer(np.asarray(encoding.codec.encode(pose, gripper)), encoding.style)
+        for text in task.all_instructions():
+            prompt = build_prompt(encoding, text, pose, gripper, keypoint)
+            encode_text(tokenizer, prompt, answer, encoding.max_text_length)

@@ -1,6 +1,7 @@
 """The two programs as a person runs them: mistakes end in one clear message, a non-zero status and no traceback."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -49,3 +50,38 @@ def test_an_existing_run_is_not_overwritten(tmp_path: Path):
     assert "already holds a run" in result.stderr
     assert "Traceback" not in result.stderr
     assert config.read_text() == "{}"
+
+
+@pytest.mark.slow
+def test_damage_ends_in_one_message_and_loses_nothing(tmp_path: Path):
+    """A truncated demonstration file and the checkpoint of another model size, as train.py and eval.py meet them."""
+    small = ["tiny", "--steps", "2", "--data.tasks", "lamp_on", "--data.episodes", "4", "--batch-size", "4"]
+
+    def train(name: str, *more: str) -> subprocess.CompletedProcess[str]:
+        return run(str(ROOT / "train.py"), *small, "--run", name, *more, folder=tmp_path)
+
+    for name, layers in (("one", "3"), ("other", "2")):
+        result = train(name, "--model.language.layers", layers)
+        assert result.returncode == 0, result.stderr
+    shutil.rmtree(tmp_path / "other" / "checkpoints")
+    shutil.copytree(tmp_path / "one" / "checkpoints", tmp_path / "other" / "checkpoints")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for program, arguments in (("eval.py", ["other"]), ("train.py", [])):
+        result = (
+            run(str(ROOT / program), *arguments, folder=tmp_path)
+            if arguments
+            else train("other", "--model.language.layers", "2", "--steps", "3", "--resume")
+        )
+        assert result.returncode == 1
+        assert "Traceback" not in result.stderr
+        assert "other" in result.stderr
+
+    (shard,) = (tmp_path / "data" / "demos").glob("*.array_record")
+    shard.write_bytes(shard.read_bytes()[:1000])
+    before[shard] = shard.read_bytes()
+    result = train("third")
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert shard.name in result.stderr
+    assert "truncated" in result.stderr
+    assert {path: path.read_bytes() for path in before} == before

@@ -97,7 +97,7 @@ TASK = task.Task(
         "take the notebook off the holder",
         "push the laptop over the edge and lift it",
         "lift the laptop off its holder with both arms",
-        "use one arm to slide the laptop and the other to pick it up",
+        "slide the laptop with one arm and lift it with the other",
     ),
     keypoints=_keypoints,
     success=_success,

@@ -78,7 +78,7 @@ TASK = task.Task(
         "push the box onto the red square",
         "use both arms to push the box to the red square",
         "slide the heavy box onto the red target",
-        "move the box to the red area by pushing it with both hands",
+        "push the box to the red area with both hands",
     ),
     keypoints=_keypoints,
     success=_success,
