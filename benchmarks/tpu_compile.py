@@ -1,6 +1,7 @@
 """Observing and executing a keyframe compile for a TPU v5e 2x2 slice, 1,024 episodes, every task (20 minutes).
 
 Usage: python -m benchmarks.tpu_compile [--tasks ...] [--episodes 1024] [--out docs/tpu_compile.json]
+then python -m docs.gallery writes the figures into docs/tasks.md.
 
 Ahead of time and from any CPU: it needs the libtpu package (pip install "dsvla-jax[planner]"), not a TPU. Exits with 77
 where libtpu is missing. With --out, tasks that the file already has are not compiled again.

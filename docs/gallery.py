@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import json
 import re
 import sys
 from pathlib import Path
@@ -34,6 +35,15 @@ changes its colours, counts or places, and the instruction with them (the first 
 three to five ways to say it. "Key poses" is how many the expert takes. [Adding a task](tasks_adding.md) takes one file.
 
 This page and its pictures are made by `python -m docs.gallery`.
+"""
+TPU = """## On accelerators
+
+Observing (128 px) and executing one key pose of {episodes} episodes in MJX, compiled ahead of time for a TPU v5e 2x2 slice
+from a CPU by `python -m benchmarks.tpu_compile`: seconds to trace and lower and to compile there, and the memory that
+arguments, results and temporaries take on each of the four chips (16 GiB). No TPU has run them.
+
+| task | lower, s | compile, s | MiB a chip |
+|---|---:|---:|---:|
 """
 
 
@@ -84,12 +94,25 @@ def row(task: Task) -> str:
     return "| " + " | ".join(map(str, cells)) + " |"
 
 
+def tpu_table(results: dict[str, dict[str, float]]) -> str:
+    """What `benchmarks.tpu_compile` measured."""
+    rows = [
+        f"| `{name}` | {r['lower_seconds']:.0f} | {r['compile_seconds']:.0f} | {r['mib_a_chip']:.0f} |"
+        for name, r in sorted(results.items())
+    ]
+    episodes = ", ".join(dict.fromkeys(f"{r['episodes']:,}" for r in results.values()))
+    return TPU.format(episodes=episodes) + "\n".join(rows) + "\n"
+
+
 def write_page() -> Path:
     parts = [INTRODUCTION.format(count=len(TASKS))]
     for arms, title in GROUPS.items():
         tasks = [task for _, task in sorted(TASKS.items()) if task.num_arms == arms]
         table = ["| start, success | task | instruction | variations | key poses |", "|---|---|---|---:|---:|"]
         parts.append("\n".join([f"## {title} ({len(tasks)})", "", *table, *map(row, tasks), ""]))
+    compiled = DOCS / "tpu_compile.json"
+    if compiled.exists():
+        parts.append(tpu_table(json.loads(compiled.read_text())))
     path = DOCS / "tasks.md"
     path.write_text("\n".join(parts))
     return path

@@ -22,7 +22,7 @@ RAIL = 0.01  # radius of the rails on which it lies; they are at RAILS along the
 RAILS = (-0.09, 0.02)
 TALL = 0.17  # height of the rack
 # Success: how far the bottle's origin may be from where it lies in the slot.
-NEAR = (0.05, 0.035, 0.04)
+NEAR = (0.05, 0.025, 0.04)
 # The expert: angle between the hand's axis and straight down at the grasp; how far it backs off, lifts and inserts.
 TILT, BACK, LIFT, INSERT, ABOVE = np.deg2rad(45.0), 0.09, 0.1, 0.13, 0.004
 
