@@ -38,9 +38,9 @@ This page and its pictures are made by `python -m docs.gallery`.
 """
 TPU = """## On accelerators
 
-Observing (128 px) and executing one key pose of {episodes} episodes in MJX, compiled ahead of time for a TPU v5e 2x2 slice
-from a CPU by `python -m benchmarks.tpu_compile`: seconds to trace and lower and to compile there, and the memory that
-arguments, results and temporaries take on each of the four chips (16 GiB). No TPU has run them.
+Observing (128 px) and executing one key pose of {episodes} episodes in MJX, compiled ahead of time for a TPU v5e 2x2
+slice from a CPU by `python -m benchmarks.tpu_compile`: seconds to trace and lower and to compile there, and the memory
+that arguments, results and temporaries take on each of the four chips (16 GiB). No TPU has run them.
 
 | task | lower, s | compile, s | MiB a chip |
 |---|---:|---:|---:|
