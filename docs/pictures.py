@@ -1,4 +1,4 @@
-"""Draws the README's picture, one scripted demonstration a task: python -m docs.pictures"""
+"""Draws the README's picture, a scripted demonstration of each task that `make train` learns: python -m docs.pictures"""
 
 from pathlib import Path
 
@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 
 from dsvla_jax.command_line import configure_jax
+from dsvla_jax.data_config import DataConfig
 from dsvla_jax.report import film_strip, mark_targets
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.types import Action
 
 SIZE, COLUMNS = 224, 5
@@ -32,7 +32,7 @@ def demonstration(name: str) -> np.ndarray:
 
 def main() -> None:
     configure_jax()
-    strips = [demonstration(name) for name in TASKS]
+    strips = [demonstration(name) for name in DataConfig().tasks]
     path = Path(__file__).parent / "images" / "episodes.png"
     path.parent.mkdir(exist_ok=True)
     cv2.imwrite(str(path), np.concatenate(strips)[..., ::-1])
