@@ -1,4 +1,4 @@
-"""Draws the README's picture, a scripted demonstration of each task that `make train` learns: python -m docs.pictures"""
+"""Draws the README's picture, a demonstration of each task that `make train` learns: python -m docs.pictures"""
 
 from pathlib import Path
 
