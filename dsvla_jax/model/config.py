@@ -49,8 +49,37 @@ class VisionConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class RopeScaling:
+    """Llama 3.1's stretch of the rotary wavelengths beyond the context that the model was first trained with.
+
+    A wavelength that fits less than ``low_frequency_factor`` times into ``original_context`` is multiplied by
+    ``factor``; one that fits more than ``high_frequency_factor`` times is left alone; frequencies between are blended.
+    The defaults are Llama 3.1's.
+    """
+
+    factor: float = 8.0
+    low_frequency_factor: float = 1.0
+    high_frequency_factor: float = 4.0
+    original_context: int = 8192
+
+    def __post_init__(self):
+        _require(
+            self.factor > 0 and self.original_context > 0,
+            f"rope_scaling: factor {self.factor} and original_context {self.original_context} must be positive",
+        )
+        _require(
+            self.high_frequency_factor > self.low_frequency_factor,
+            f"rope_scaling: high_frequency_factor {self.high_frequency_factor} must be larger than "
+            f"low_frequency_factor {self.low_frequency_factor}",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class LanguageConfig:
-    """A LLaMA decoder; the defaults are LLaMA-7B."""
+    """A LLaMA decoder; the defaults are LLaMA-7B.
+
+    explicit_head_dim: width of one head; None for width / heads.
+    """
 
     vocab_size: int = 32000
     width: int = 4096
@@ -61,12 +90,21 @@ class LanguageConfig:
     rope_theta: float = 10000.0
     norm_eps: float = 1e-6
     tie_embeddings: bool = False
+    explicit_head_dim: int | None = None
+    rope_scaling: RopeScaling | None = None
 
     def __post_init__(self):
-        _require(
-            self.width % (2 * self.heads) == 0,
-            f"language: width {self.width} must be a multiple of 2 * heads = {2 * self.heads} (rotary halves)",
-        )
+        if self.explicit_head_dim is None:
+            _require(
+                self.width % (2 * self.heads) == 0,
+                f"language: width {self.width} must be a multiple of 2 * heads = {2 * self.heads} (rotary halves), "
+                "unless explicit_head_dim is given",
+            )
+        else:
+            _require(
+                self.explicit_head_dim > 0 and self.explicit_head_dim % 2 == 0,
+                f"language: explicit_head_dim must be positive and even (rotary halves), got {self.explicit_head_dim}",
+            )
         _require(
             self.heads % self.kv_heads == 0,
             f"language: heads {self.heads} is not a multiple of kv_heads {self.kv_heads}",
@@ -74,7 +112,7 @@ class LanguageConfig:
 
     @property
     def head_dim(self) -> int:
-        return self.width // self.heads
+        return self.explicit_head_dim or self.width // self.heads
 
 
 @dataclasses.dataclass(frozen=True)

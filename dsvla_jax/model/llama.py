@@ -6,6 +6,7 @@ Touvron et al. 2023; parameter layout and rotation as in Hugging Face's Llama.
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from dsvla_jax.model.attention import attend, join_heads, split_heads
@@ -43,11 +44,23 @@ class RMSNorm(nn.Module):
         return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + self.epsilon) * scale
 
 
+def rotary_frequencies(config: LanguageConfig) -> np.ndarray:
+    """Radians a position, float32 (D / 2,). Computed in double: an error would grow with the position."""
+    half = config.head_dim // 2
+    frequencies = config.rope_theta ** (-np.arange(half) / half)
+    scaling = config.rope_scaling
+    if scaling is not None:
+        # How often the wavelength fits into the original context decides between stretching and leaving alone.
+        fits = scaling.original_context * frequencies / (2 * np.pi)
+        low, high = scaling.low_frequency_factor, scaling.high_frequency_factor
+        kept = np.clip((fits - low) / (high - low), 0.0, 1.0)
+        frequencies = frequencies * (kept + (1 - kept) / scaling.factor)
+    return frequencies.astype(np.float32)
+
+
 def rotary_tables(positions: Array, config: LanguageConfig) -> tuple[Array, Array]:
     """Positions int32 (B, T) -> cosines and sines, float32 (B, 1, T, D / 2)."""
-    half = config.head_dim // 2
-    frequencies = config.rope_theta ** (-jnp.arange(half, dtype=jnp.float32) / half)
-    angles = positions[:, None, :, None].astype(jnp.float32) * frequencies
+    angles = positions[:, None, :, None].astype(jnp.float32) * rotary_frequencies(config)
     return jnp.cos(angles), jnp.sin(angles)
 
 
@@ -70,10 +83,10 @@ class DecoderBlock(nn.Module):
         language, dtype = self.config.language, self.config.compute_dtype
         options = {"lora": self.config.lora_for("language"), "dtype": dtype}
         into_residual = residual_init(language.layers)
-        kv_width = language.kv_heads * language.head_dim
+        query_width, kv_width = language.heads * language.head_dim, language.kv_heads * language.head_dim
 
         y = RMSNorm(language.norm_eps, name="attention_norm")(x)
-        query = rotate(split_heads(LoraDense(language.width, name="q", **options)(y), language.heads), tables)
+        query = rotate(split_heads(LoraDense(query_width, name="q", **options)(y), language.heads), tables)
         key = rotate(split_heads(LoraDense(kv_width, name="k", **options)(y), language.kv_heads), tables)
         value = split_heads(LoraDense(kv_width, name="v", **options)(y), language.kv_heads)
         if cache is not None:

@@ -1,0 +1,133 @@
+"""Reading a folder of safetensors files a tensor at a time, without the framework that wrote it.
+
+The format: 8 bytes n (little-endian), n bytes of JSON {name: {dtype, shape, data_offsets}}, the tensors' bytes (offsets
+count from behind the JSON). A checkpoint in several files has an index, {"weight_map": {name: file}}.
+https://github.com/huggingface/safetensors (README, "Format").
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import ml_dtypes
+import numpy as np
+
+from dsvla_jax.errors import UserError
+
+FLOATS = {"F32": np.dtype(np.float32), "F16": np.dtype(np.float16), "BF16": np.dtype(ml_dtypes.bfloat16)}
+INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
+AGAIN = "download it again"
+
+
+class WeightsError(UserError):
+    """A checkpoint of another project is missing, damaged, or of a kind that does not fit here."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredTensor:
+    """Where one tensor lies. begin: its first byte, from the start of the file."""
+
+    key: str
+    file: Path
+    dtype: str
+    shape: tuple[int, ...]
+    begin: int
+    end: int
+
+    def read(self) -> np.ndarray:
+        """The tensor as it is stored: a read-only array over the mapped file, loaded as it is used."""
+        dtype = FLOATS.get(self.dtype)
+        if dtype is None:
+            raise WeightsError(
+                f"{self.file}: {self.key}: expected dtype {', '.join(FLOATS)}, found {self.dtype}; "
+                "use an unquantised checkpoint"
+            )
+        if self.end - self.begin != int(np.prod(self.shape)) * dtype.itemsize:
+            raise WeightsError(
+                f"{self.file}: {self.key}: {self.dtype} {self.shape} does not fill the {self.end - self.begin} bytes "
+                f"that the header gives it: the file is damaged; {AGAIN}"
+            )
+        return np.memmap(self.file, dtype, "r", offset=self.begin, shape=self.shape)
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON object. Raises WeightsError naming the file where it is missing or something else."""
+    if not file.is_file():
+        raise WeightsError(f"{file}: missing; expected the folder of a Hugging Face checkpoint")
+    try:
+        content = json.loads(file.read_bytes())
+    except ValueError as error:
+        raise WeightsError(f"{file}: not JSON ({error}): the file is damaged; {AGAIN}") from error
+    if not isinstance(content, dict):
+        raise WeightsError(f"{file}: expected a JSON object, found {type(content).__name__}; {AGAIN}")
+    return content
+
+
+def list_tensors(folder: Path) -> dict[str, StoredTensor]:
+    """Every tensor of a checkpoint, from the headers of its one file or its shards; no tensor is read."""
+    if (folder / INDEX).is_file():
+        return _list_shards(folder)
+    file = folder / SINGLE
+    if file.is_file():
+        return _list_file(file)
+    others = sorted(path.name for path in folder.glob("*.safetensors"))
+    if not others:
+        raise WeightsError(
+            f"{folder}: holds neither {SINGLE} nor {INDEX}; convert other formats with transformers' "
+            "save_pretrained(..., safe_serialization=True)"
+        )
+    raise WeightsError(f"{folder / INDEX}: missing, so it is unknown whether {', '.join(others)} is all; {AGAIN}")
+
+
+def _list_shards(folder: Path) -> dict[str, StoredTensor]:
+    index = folder / INDEX
+    weight_map = read_json(index).get("weight_map")
+    if not isinstance(weight_map, Mapping) or not all(isinstance(name, str) for name in weight_map.values()):
+        raise WeightsError(f"{index}: expected a weight_map of names to files; {AGAIN}")
+    tensors: dict[str, StoredTensor] = {}
+    for name in sorted(set(weight_map.values())):
+        shard = folder / name
+        if shard.name != name or not shard.is_file():
+            raise WeightsError(f"{shard}: this shard is missing, {index.name} names it; {AGAIN}")
+        tensors |= _list_file(shard)
+    for key, name in weight_map.items():
+        if key not in tensors or tensors[key].file.name != name:
+            raise WeightsError(f"{folder / name}: {key} is not in it, though {index.name} says so; {AGAIN}")
+    return tensors
+
+
+def _list_file(file: Path) -> dict[str, StoredTensor]:
+    size = file.stat().st_size
+    with file.open("rb") as stream:
+        prefix = stream.read(8)
+        length = int.from_bytes(prefix, "little")
+        if len(prefix) < 8 or 8 + length > size:
+            raise WeightsError(
+                f"{file}: {size} bytes, but its header alone should have {8 + length}: cut short or not a "
+                f"safetensors file; {AGAIN}"
+            )
+        try:
+            header = json.loads(stream.read(length))
+            header.pop("__metadata__", None)
+            tensors = {
+                key: StoredTensor(
+                    key,
+                    file,
+                    entry["dtype"],
+                    tuple(map(int, entry["shape"])),
+                    *(8 + length + int(offset) for offset in entry["data_offsets"]),
+                )
+                for key, entry in header.items()
+            }
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise WeightsError(f"{file}: its header is not that of a safetensors file ({error!r}); {AGAIN}") from error
+    for tensor in tensors.values():
+        if not 8 + length <= tensor.begin <= tensor.end:
+            raise WeightsError(f"{file}: {tensor.key}: impossible offsets in the header; {AGAIN}")
+        if tensor.end > size:
+            raise WeightsError(
+                f"{file}: {tensor.key}: ends at byte {tensor.end}, the file has {size}: cut short; {AGAIN}"
+            )
+    return tensors

@@ -1,0 +1,173 @@
+"""LLaMA decoders and CLIP vision towers of Hugging Face checkpoints, as parameters of `dsvla_jax.model`.
+
+Names are those of transformers' LlamaForCausalLM and CLIPVisionModel behind whatever prefix the checkpoint puts in
+front of them ("model.", "vision_model.", "vision_tower.vision_model.", nothing).
+"""
+
+import dataclasses
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+from tqdm import tqdm
+
+from dsvla_jax.model.clip import VisionTower
+from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
+from dsvla_jax.model.llama import Llama
+from dsvla_jax.weights.configs import read_language_config, read_vision_config
+from dsvla_jax.weights.positions import resample_positions
+from dsvla_jax.weights.safetensors import StoredTensor, WeightsError, list_tensors
+
+LLAMA_NAMES = {
+    "embedding": "embed_tokens.weight",
+    "norm/scale": "norm.weight",
+    "layers/attention_norm/scale": "layers.{}.input_layernorm.weight",
+    "layers/mlp_norm/scale": "layers.{}.post_attention_layernorm.weight",
+    **{f"layers/{name}/kernel": f"layers.{{}}.self_attn.{name}_proj.weight" for name in "qkvo"},
+    **{f"layers/{name}/kernel": f"layers.{{}}.mlp.{name}_proj.weight" for name in ("gate", "up", "down")},
+}
+LM_HEAD = "lm_head.weight"
+
+# With weight and bias each, the weight being our `kernel` or `scale`.
+_CLIP_LAYERS = {
+    "ln_pre/scale": "pre_layrnorm",  # sic, in every published checkpoint
+    "ln_post/scale": "post_layernorm",
+    "layers/attention_norm/scale": "encoder.layers.{}.layer_norm1",
+    "layers/mlp_norm/scale": "encoder.layers.{}.layer_norm2",
+    **{f"layers/{name}/kernel": f"encoder.layers.{{}}.self_attn.{name}_proj" for name in "qkv"},
+    "layers/o/kernel": "encoder.layers.{}.self_attn.out_proj",
+    "layers/up/kernel": "encoder.layers.{}.mlp.fc1",
+    "layers/down/kernel": "encoder.layers.{}.mlp.fc2",
+}
+CLIP_NAMES = {
+    "patch_kernel": "embeddings.patch_embedding.weight",
+    "class_embedding": "embeddings.class_embedding",
+    "positional_embedding": "embeddings.position_embedding.weight",
+    **{ours: f"{theirs}.weight" for ours, theirs in _CLIP_LAYERS.items()},
+    **{f"{ours.rsplit('/', 1)[0]}/bias": f"{theirs}.bias" for ours, theirs in _CLIP_LAYERS.items()},
+}
+
+# Which of the stored axes becomes each of ours: (out, in) -> (in, out), (out, in, y, x) -> (y, x, in, out).
+AXES = {"kernel": (1, 0), "output": (1, 0), "patch_kernel": (2, 3, 1, 0)}
+
+# Constants that old versions of transformers saved with the parameters.
+BUFFERS = ("rotary_emb.inv_freq", "embeddings.position_ids")
+
+
+@dataclasses.dataclass(frozen=True)
+class Tower:
+    """What was read. params: nested dict of arrays, layers stacked. unused: keys of the checkpoint left alone."""
+
+    config: LanguageConfig | VisionConfig
+    params: dict[str, Any]
+    unused: tuple[str, ...]
+
+
+def read_language(folder: Path, dtype: Any = np.float32) -> Tower:
+    """The LLaMA decoder of a checkpoint: params of `dsvla_jax.model.llama.Llama` in ``dtype``.
+
+    Reads a tensor at a time. Raises WeightsError naming file and key where anything is missing, left over within the
+    decoder, or of another shape than config.json says.
+    """
+    config = read_language_config(folder)
+    tensors = list_tensors(folder)
+    prefix = _find_prefix(tensors, LLAMA_NAMES["embedding"], folder)
+    head = prefix.removesuffix("model.") + LM_HEAD
+    model = Llama(ModelConfig(language=config))
+    token = jnp.zeros((1, 1, config.width))
+    shapes = jax.eval_shape(model.init, jax.random.key(0), token, jnp.zeros((1, 1), int), jnp.ones((1, 1, 1), bool))
+    names = {ours: prefix + theirs for ours, theirs in LLAMA_NAMES.items()}
+    if not config.tie_embeddings:
+        names["output"] = head
+    params, unused = _fill(shapes["params"], names, tensors, prefix, (LM_HEAD,) if config.tie_embeddings else (), dtype)
+    return Tower(config, params, unused)
+
+
+def read_vision(folder: Path, image_size: int | None = None, dtype: Any = np.float32) -> Tower:
+    """The CLIP vision tower of a checkpoint: params of `dsvla_jax.model.clip.VisionTower` in ``dtype``.
+
+    image_size: pixels; None for the checkpoint's own. Positional embeddings are resampled to another size's grid.
+    Raises WeightsError as `read_language` does.
+    """
+    config = read_vision_config(folder)
+    tensors = list_tensors(folder)
+    prefix = _find_prefix(tensors, CLIP_NAMES["class_embedding"], folder)
+    size, width = config.image_size, config.width
+    empty = jnp.zeros((1, 0, width)), jnp.zeros((1, 0), int)
+    shapes = jax.eval_shape(
+        VisionTower(ModelConfig(vision=config)).init, jax.random.key(0), jnp.zeros((1, size, size, 3)), *empty
+    )
+    names = {ours: prefix + theirs for ours, theirs in CLIP_NAMES.items()}
+    params, unused = _fill(shapes["params"], names, tensors, prefix, (), dtype)
+    if image_size is not None and image_size != size:
+        try:
+            config = dataclasses.replace(config, image_size=image_size)
+        except ValueError as error:
+            raise WeightsError(f"image size {image_size} does not suit the tower in {folder}: {error}") from error
+        params["positional_embedding"] = resample_positions(params["positional_embedding"], config.grid).astype(dtype)
+    return Tower(config, params, unused)
+
+
+def summarize(keys: Iterable[str]) -> str:
+    """Keys in one line, those that differ by the layer only told once."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for key in sorted(keys):
+        groups[re.sub(r"\.\d+\.", ".*.", key)].append(key)
+    return ", ".join(same[0] if len(same) == 1 else f"{name} ({len(same)})" for name, same in groups.items())
+
+
+def _find_prefix(tensors: Mapping[str, StoredTensor], name: str, folder: Path) -> str:
+    """What the checkpoint puts in front of its names, told from a name that only this kind of tower has."""
+    found = [key.removesuffix(name) for key in tensors if key == name or key.endswith("." + name)]
+    if len(found) != 1:
+        what = "none does" if not found else f"these do: {', '.join(prefix + name for prefix in found)}"
+        raise WeightsError(
+            f"{folder}: wrong architecture: expected one of its {len(tensors)} tensors to be named [...]{name}, {what}"
+        )
+    return found[0]
+
+
+def _fill(
+    shapes: Mapping[str, Any],
+    names: Mapping[str, str],
+    tensors: Mapping[str, StoredTensor],
+    prefix: str,
+    droppable: tuple[str, ...],
+    dtype: Any,
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Arrays for the tree of ``shapes`` from ``names`` (theirs for each of ours), and the keys that were not needed."""
+    flat: dict[str, Any] = traverse_util.flatten_dict(shapes, sep="/")
+    places: dict[str, tuple[str, int | None]] = {}
+    for ours, leaf in flat.items():
+        if ours.startswith("layers/"):
+            places |= {names[ours].format(layer): (ours, layer) for layer in range(leaf.shape[0])}
+        else:
+            places[names[ours]] = (ours, None)
+
+    missing = [key for key in places if key not in tensors]
+    unused = tuple(key for key in tensors if key not in places)
+    strange = [key for key in unused if key.startswith(prefix) and not key.endswith(BUFFERS + droppable)]
+    if missing or strange:
+        folder = next(iter(tensors.values())).file.parent
+        problems = [
+            f"{label} {summarize(keys)}"
+            for label, keys in (("missing:", missing), ("no place in this architecture for:", strange))
+            if keys
+        ]
+        raise WeightsError(f"{folder}: its tensors do not fit its config.json: {'; '.join(problems)}")
+
+    arrays = {ours: np.empty(leaf.shape, dtype) for ours, leaf in flat.items()}
+    for key, (ours, layer) in tqdm(places.items(), desc="read", unit="tensor", disable=None):
+        tensor, target = tensors[key], arrays[ours] if layer is None else arrays[ours][layer]
+        axes = AXES.get(ours.rsplit("/", 1)[-1], tuple(range(target.ndim)))
+        expected = tuple(target.shape[axes.index(axis)] for axis in range(target.ndim))
+        if tensor.shape != expected:
+            raise WeightsError(f"{tensor.file}: {key}: expected shape {expected} by config.json, found {tensor.shape}")
+        target[...] = tensor.read().transpose(axes)
+    return traverse_util.unflatten_dict(arrays, sep="/"), unused
