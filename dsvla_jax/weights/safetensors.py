@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import ml_dtypes
+import jax.numpy as jnp
 import numpy as np
 
 from dsvla_jax.errors import UserError
 
-FLOATS = {"F32": np.dtype(np.float32), "F16": np.dtype(np.float16), "BF16": np.dtype(ml_dtypes.bfloat16)}
+FLOATS = {"F32": np.dtype(np.float32), "F16": np.dtype(np.float16), "BF16": np.dtype(jnp.bfloat16)}
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
 AGAIN = "download it again"
 
@@ -115,7 +115,7 @@ def _list_file(file: Path) -> dict[str, StoredTensor]:
                 key: StoredTensor(
                     key,
                     file,
-                    entry["dtype"],
+                    str(entry["dtype"]),
                     tuple(map(int, entry["shape"])),
                     *(8 + length + int(offset) for offset in entry["data_offsets"]),
                 )

@@ -79,13 +79,12 @@ def read_language(folder: Path, dtype: Any = np.float32) -> Tower:
     tensors = list_tensors(folder)
     prefix = _find_prefix(tensors, LLAMA_NAMES["embedding"], folder)
     head = prefix.removesuffix("model.") + LM_HEAD
-    model = Llama(ModelConfig(language=config))
-    token = jnp.zeros((1, 1, config.width))
-    shapes = jax.eval_shape(model.init, jax.random.key(0), token, jnp.zeros((1, 1), int), jnp.ones((1, 1, 1), bool))
     names = {ours: prefix + theirs for ours, theirs in LLAMA_NAMES.items()}
     if not config.tie_embeddings:
         names["output"] = head
-    params, unused = _fill(shapes["params"], names, tensors, prefix, (LM_HEAD,) if config.tie_embeddings else (), dtype)
+    params, unused = _fill(
+        tower_shapes(config), names, tensors, prefix, (LM_HEAD,) if config.tie_embeddings else (), dtype
+    )
     return Tower(config, params, unused)
 
 
@@ -98,20 +97,27 @@ def read_vision(folder: Path, image_size: int | None = None, dtype: Any = np.flo
     config = read_vision_config(folder)
     tensors = list_tensors(folder)
     prefix = _find_prefix(tensors, CLIP_NAMES["class_embedding"], folder)
-    size, width = config.image_size, config.width
-    empty = jnp.zeros((1, 0, width)), jnp.zeros((1, 0), int)
-    shapes = jax.eval_shape(
-        VisionTower(ModelConfig(vision=config)).init, jax.random.key(0), jnp.zeros((1, size, size, 3)), *empty
-    )
     names = {ours: prefix + theirs for ours, theirs in CLIP_NAMES.items()}
-    params, unused = _fill(shapes["params"], names, tensors, prefix, (), dtype)
-    if image_size is not None and image_size != size:
+    params, unused = _fill(tower_shapes(config), names, tensors, prefix, (), dtype)
+    if image_size is not None and image_size != config.image_size:
         try:
             config = dataclasses.replace(config, image_size=image_size)
         except ValueError as error:
             raise WeightsError(f"image size {image_size} does not suit the tower in {folder}: {error}") from error
         params["positional_embedding"] = resample_positions(params["positional_embedding"], config.grid).astype(dtype)
     return Tower(config, params, unused)
+
+
+def tower_shapes(config: LanguageConfig | VisionConfig) -> dict[str, Any]:
+    """The tree of a tower's params, as float32 ShapeDtypeStructs."""
+    if isinstance(config, LanguageConfig):
+        model, inputs = Llama(ModelConfig(language=config)), ((1, 1, config.width), (1, 1), (1, 1, 1))
+    else:
+        model = VisionTower(ModelConfig(vision=config))
+        inputs = ((1, config.image_size, config.image_size, 3), (1, 0, config.width), (1, 0))
+    first, *rest = inputs
+    arrays = jnp.zeros(first), *(jnp.zeros(shape, int) for shape in rest)
+    return jax.eval_shape(model.init, jax.random.key(0), *arrays)["params"]
 
 
 def summarize(keys: Iterable[str]) -> str:

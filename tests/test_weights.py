@@ -1,0 +1,339 @@
+"""Reading Hugging Face folders: names, dtypes, damage; and the imported folder that training starts from."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dsvla_jax.checkpoints import CheckpointError, save_weights
+from dsvla_jax.model.config import LanguageConfig, ModelConfig, RopeScaling, VisionConfig
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.types import ModelInputs
+from dsvla_jax.weights import __main__ as program
+from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.positions import resample_positions
+from dsvla_jax.weights.safetensors import WeightsError, list_tensors
+from dsvla_jax.weights.towers import read_language, read_vision, summarize
+from tests.golden.backbones import draw
+from tests.safetensors_files import write_checkpoint
+
+GOLDEN = Path(__file__).parent / "golden"
+CASES = json.loads((GOLDEN / "backbones.json").read_text())
+SHARD = "model-00002-of-00003.safetensors"
+
+
+@pytest.fixture
+def sharded(tmp_path):
+    """A copy of transformers' own sharded checkpoint, to be damaged."""
+    return Path(shutil.copytree(GOLDEN / "llama_sharded", tmp_path / "source"))
+
+
+def case_tensors(name):
+    return {key: draw(key, tuple(shape)) for key, shape in CASES[name]["shapes"].items()}
+
+
+def assert_same(left, right):
+    jax.tree.map(np.testing.assert_array_equal, left, right)
+
+
+def change_json(file, **changes):
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+@pytest.mark.parametrize("prefix", ["", "model.", "language_model.model."])
+def test_llama_behind_any_prefix(tmp_path, prefix):
+    tensors = case_tensors("plain")
+    head = tensors.pop("lm_head.weight")
+    renamed = {prefix + key.removeprefix("model."): value for key, value in tensors.items()}
+    renamed[prefix.removesuffix("model.") + "lm_head.weight"] = head
+    tower = read_language(write_checkpoint(tmp_path / "source", CASES["plain"]["config"], renamed))
+    np.testing.assert_array_equal(tower.params["output"], head.T)
+    np.testing.assert_array_equal(
+        tower.params["layers"]["down"]["kernel"][1], tensors["model.layers.1.mlp.down_proj.weight"].T
+    )
+
+
+@pytest.mark.parametrize("prefix", ["", "vision_model.", "vision_tower.vision_model."])
+def test_clip_behind_any_prefix_and_within_other_configs(tmp_path, prefix):
+    tensors = {prefix + key: value for key, value in case_tensors("odd_grid").items()}
+    config = CASES["odd_grid"]["config"]
+    if prefix:
+        config = {"model_type": "llava", "vision_config": config}
+        tensors["elsewhere.weight"] = np.zeros(3, np.int64)
+    tower = read_vision(write_checkpoint(tmp_path / "source", config, tensors))
+    assert tower.unused == (("elsewhere.weight",) if prefix else ())
+    kernel = tensors[prefix + "embeddings.patch_embedding.weight"]
+    np.testing.assert_array_equal(tower.params["patch_kernel"][1, 2, 0], kernel[:, 0, 1, 2])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16, jnp.bfloat16])
+def test_every_dtype_is_read_exactly(tmp_path, dtype):
+    tensors = {key: value.astype(dtype) for key, value in case_tensors("grouped_tied").items()}
+    tower = read_language(write_checkpoint(tmp_path / "source", CASES["grouped_tied"]["config"], tensors))
+    table = tower.params["embedding"]
+    assert table.dtype == np.float32
+    np.testing.assert_array_equal(table, tensors["model.embed_tokens.weight"].astype(np.float32))
+
+
+def test_old_configs_mean_the_same(tmp_path):
+    """Before transformers 5: rope_theta and rope_scaling, no head_dim; Llama 1 had no num_key_value_heads."""
+    new = CASES["llama3"]["config"]
+    rope = dict(new["rope_parameters"])
+    old = {key: value for key, value in new.items() if key not in ("rope_parameters", "head_dim")}
+    old |= {"rope_theta": rope.pop("rope_theta"), "rope_scaling": rope}
+    folder = write_checkpoint(tmp_path / "llama3", old, case_tensors("llama3"))
+    config = read_language(folder).config
+    assert isinstance(config, LanguageConfig)
+    assert config.rope_scaling == RopeScaling(8.0, 1.0, 4.0, 40)
+    assert (config.rope_theta, config.kv_heads, config.head_dim) == (10000.0, 1, 16)
+
+    new = CASES["plain"]["config"]
+    old = {
+        key: value for key, value in new.items() if key not in ("rope_parameters", "head_dim", "num_key_value_heads")
+    }
+    config = read_language(write_checkpoint(tmp_path / "plain", old, case_tensors("plain"))).config
+    assert isinstance(config, LanguageConfig)
+    assert config.kv_heads == 4
+
+
+def test_left_out_fields_have_the_defaults_of_the_architecture(tmp_path):
+    folder = tmp_path / "source"
+    folder.mkdir()
+    (folder / "config.json").write_text('{"model_type": "llama", "vocab_size": 32000}')
+    with pytest.raises(WeightsError, match="holds neither model"):
+        read_language(folder)  # the config is LLaMA-7B's, and only then are files looked for
+
+
+def test_saved_buffers_and_the_copy_of_a_tied_table_are_left_alone(tmp_path):
+    tensors = case_tensors("grouped_tied")
+    extra = {
+        "lm_head.weight": tensors["model.embed_tokens.weight"],
+        "model.layers.0.self_attn.rotary_emb.inv_freq": np.zeros(3, np.float32),
+    }
+    folder = write_checkpoint(tmp_path / "source", CASES["grouped_tied"]["config"], tensors | extra)
+    assert set(read_language(folder).unused) == set(extra)
+
+
+def test_missing_and_surplus_tensors_are_all_named(tmp_path):
+    tensors = case_tensors("plain")
+    del tensors["model.norm.weight"], tensors["model.layers.0.mlp.up_proj.weight"]
+    for layer in (0, 1):
+        tensors[f"model.layers.{layer}.self_attn.q_proj.bias"] = np.zeros(32, np.float32)
+    folder = write_checkpoint(tmp_path / "source", CASES["plain"]["config"], tensors)
+    with pytest.raises(WeightsError) as error:
+        read_language(folder)
+    assert "missing: model.layers.0.mlp.up_proj.weight, model.norm.weight;" in str(error.value)
+    assert "no place in this architecture for: model.layers.*.self_attn.q_proj.bias (2)" in str(error.value)
+
+
+def test_summaries_tell_layers_once():
+    assert summarize(["b.10.w", "b.9.w", "c.3.w", "a"]) == "a, b.*.w (2), c.3.w"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model_type": "qwen2"}, r"config.json: wrong architecture: expected model_type 'llama' .* found 'qwen2'"),
+        ({"attention_bias": True}, "config.json: attention_bias: only False is supported, found True"),
+        ({"hidden_act": "gelu"}, "config.json: hidden_act: only 'silu' is supported, found 'gelu'"),
+        ({"rope_parameters": {"rope_type": "yarn"}}, "config.json: rope_type: supported are .* found 'yarn'"),
+        (
+            {"rope_parameters": {"rope_type": "llama3", "factor": 8}},
+            "'llama3' needs low_freq_factor, high_freq_factor,",
+        ),
+        ({"hidden_size": "16"}, "config.json: hidden_size: expected a number, found '16'"),
+        ({"num_hidden_layers": 0}, "config.json: num_hidden_layers: expected a positive integer, found 0"),
+        ({"num_key_value_heads": 3}, "config.json: language: heads 2 is not a multiple of kv_heads 3"),
+        ({"vocab_size": 22}, r"00001-of-.*: model.embed_tokens.weight: expected shape \(22, 16\) .* found \(21, 16\)"),
+        ({"num_hidden_layers": 1}, r"no place in this architecture for: model.layers.1.input_layernorm.weight, "),
+        ({"num_hidden_layers": 3}, r"missing: model.layers.2.input_layernorm.weight, "),
+    ],
+)
+def test_another_architecture_is_refused(sharded, changes, message):
+    change_json(sharded / "config.json", **changes)
+    with pytest.raises(WeightsError, match=message):
+        read_language(sharded)
+
+
+def cut(file, keep):
+    file.write_bytes(file.read_bytes()[:keep])
+
+
+def no_index(folder):
+    (folder / "model.safetensors.index.json").unlink()
+
+
+def only_pickles(folder):
+    for file in folder.glob("model*"):
+        file.unlink()
+    (folder / "pytorch_model.bin").touch()
+
+
+def eight_bit(folder):
+    file = folder / SHARD
+    file.write_bytes(file.read_bytes().replace(b'"dtype":"BF16"', b'"dtype":"F8E4"'))
+
+
+def half_as_wide(folder):
+    file = folder / SHARD
+    file.write_bytes(file.read_bytes().replace(b'"dtype":"BF16"', b'"dtype":"F32" '))
+
+
+def other_map(folder):
+    file = folder / "model.safetensors.index.json"
+    change_json(file, weight_map=json.loads(file.read_text())["weight_map"] | {"model.extra": SHARD})
+
+
+def outside(folder):
+    file = folder / "model.safetensors.index.json"
+    change_json(file, weight_map={"model.embed_tokens.weight": f"../source/{SHARD}"})
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda f: cut(f / SHARD, -1), r"00002-of-00003.safetensors: model\.\S+: ends at byte 4832, the file has 4831"),
+        (lambda f: cut(f / SHARD, 100), "00002-of-00003.safetensors: 100 bytes, but its header alone should have"),
+        (lambda f: cut(f / SHARD, 0), "00002-of-00003.safetensors: 0 bytes, but its header"),
+        (lambda f: (f / SHARD).write_bytes(b"\x04" + bytes(7) + b"[{}]"), "header is not that of a safetensors file"),
+        (lambda f: (f / SHARD).unlink(), "00002-of-00003.safetensors: this shard is missing, .*index.json names it"),
+        (outside, "00002-of-00003.safetensors: this shard is missing"),
+        (other_map, "00002-of-00003.safetensors: model.extra is not in it, though .*index.json says so"),
+        (no_index, r"index.json: missing, so it is unknown whether model-00001-\S+, \S+, \S+ is all"),
+        (only_pickles, "source: holds neither model.safetensors nor .* save_pretrained"),
+        (eight_bit, r"00002-of-00003.safetensors: model\.\S+: expected dtype F32, F16, BF16, found F8E4"),
+        (half_as_wide, r"00002-of-00003.safetensors: model\.\S+: F32 \(.*\) does not fill the \d+ bytes"),
+        (lambda f: cut(f / "config.json", 20), "config.json: not JSON"),
+        (lambda f: (f / "config.json").unlink(), "config.json: missing; expected the folder of a Hugging Face"),
+    ],
+)
+def test_damage_is_told_with_file_and_key(sharded, damage, message):
+    damage(sharded)
+    out = sharded.parent / "out"
+    with pytest.raises(WeightsError, match=message):
+        import_backbones(sharded, out)
+    assert not out.exists()
+
+
+def test_a_file_cut_anywhere_is_an_error(sharded):
+    content = (sharded / SHARD).read_bytes()
+    for keep in range(0, len(content), 97):
+        (sharded / SHARD).write_bytes(content[:keep])
+        with pytest.raises(WeightsError, match=SHARD):
+            list_tensors(sharded)
+
+
+def test_vision_sources_that_do_not_fit(tmp_path):
+    with pytest.raises(WeightsError, match=r"expected model_type 'clip_vision_model' .* found 'llama'"):
+        read_vision(GOLDEN / "llama_sharded")
+    with pytest.raises(WeightsError, match=r"image size 10 .* image_size 10 is not a multiple of patch_size 3"):
+        read_vision(GOLDEN / "clip", 10)
+    folder = write_checkpoint(tmp_path / "source", CASES["odd_grid"]["config"], case_tensors("plain"))
+    with pytest.raises(WeightsError, match=r"wrong architecture: .*embeddings.class_embedding, none does"):
+        read_vision(folder)
+    config = CASES["odd_grid"]["config"] | {"hidden_act": "gelu"}
+    with pytest.raises(WeightsError, match="hidden_act: only 'quick_gelu' is supported"):
+        read_vision(write_checkpoint(tmp_path / "gelu", config, case_tensors("odd_grid")))
+
+
+def test_resampled_positions_keep_constants_and_the_class_token():
+    positions = np.ones((10, 4), np.float32)
+    positions[0] = 7
+    for grid in (1, 2, 5):
+        resampled = resample_positions(positions, grid)
+        np.testing.assert_array_equal(resampled[0], 7)
+        np.testing.assert_allclose(resampled[1:], np.ones((grid * grid, 4)), atol=1e-6)
+    with pytest.raises(ValueError, match="square"):
+        resample_positions(positions[:7], 2)
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory):
+    out = tmp_path_factory.mktemp("imported") / "new" / "base"
+    return out, import_backbones(GOLDEN / "llama_sharded", out, GOLDEN / "clip", 15)
+
+
+def test_imported_folder_gives_back_configs_and_params(imported):
+    out, towers = imported
+    stored = read_towers(out)
+    assert stored.language == towers["language"].config
+    assert stored.vision == towers["vision"].config
+    assert isinstance(stored.vision, VisionConfig)
+    assert stored.vision.image_size == 15
+    assert_same(load_backbones(out), {name: tower.params for name, tower in towers.items()})
+
+
+def test_a_model_runs_from_an_imported_folder(imported):
+    out, _ = imported
+    towers = read_towers(out)
+    assert towers.vision is not None
+    config = ModelConfig(vision=towers.vision, language=towers.language)
+    variables = initialize(config, jax.random.key(0))
+    backbones = load_backbones(out)
+    assert jax.tree.map(jnp.shape, backbones) == jax.tree.map(
+        jnp.shape, {name: variables["params"][name] for name in backbones}
+    )
+    inputs = ModelInputs(
+        image=jnp.zeros((1, 15, 15, 3)),
+        point_tokens=jnp.zeros((1, 2, 16)),
+        point_patches=jnp.zeros((1, 2), jnp.int32),
+        text_tokens=jnp.ones((1, 4), jnp.int32),
+        text_mask=jnp.ones((1, 4), bool),
+    )
+    logits = VLA(config).apply({"params": variables["params"] | backbones}, inputs)
+    assert np.isfinite(np.asarray(logits)).all()
+
+
+def test_bfloat16_on_disk_is_float32_in_the_model(tmp_path):
+    """The source is bfloat16 already, so that nothing is lost."""
+    import_backbones(GOLDEN / "llama_sharded", tmp_path / "half", dtype=jnp.bfloat16)
+    params = load_backbones(tmp_path / "half")
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype(jnp.float32)}
+    assert_same(params["language"], read_language(GOLDEN / "llama_sharded").params)
+    assert read_towers(tmp_path / "half").vision is None
+
+
+def test_a_failed_write_leaves_no_folder(tmp_path):
+    with pytest.raises(TypeError):
+        save_weights(tmp_path / "out", {"a": np.ones(3, np.float32)}, {"not JSON": object()})
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_killed_import_left_is_no_hindrance(tmp_path):
+    partial = tmp_path / "out.orbax-checkpoint-tmp" / "params"
+    partial.mkdir(parents=True)
+    (partial / "manifest.ocdbt").write_bytes(b"half of it")
+    import_backbones(GOLDEN / "llama_sharded", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    load_backbones(tmp_path / "out")
+
+
+def test_an_existing_folder_is_not_touched(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(CheckpointError, match="exists already"):
+        import_backbones(GOLDEN / "llama_sharded", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_folders_that_are_no_imports_say_so(tmp_path):
+    with pytest.raises(CheckpointError, match=r"no imported weights here; .* python -m dsvla_jax.weights import"):
+        load_backbones(tmp_path)
+
+
+def test_command_line(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "base"
+    arguments = ["import", str(GOLDEN / "llama_sharded"), str(out), "--vision", str(GOLDEN / "clip")]
+    monkeypatch.setattr(sys, "argv", ["weights", *arguments])
+    program.main()
+    printed = capsys.readouterr().out
+    assert "language: 4,592 parameters" in printed
+    assert "vision: left alone: logit_scale, " in printed
+    assert read_towers(out).vision is not None
+    with pytest.raises(SystemExit):
+        program.main()
+    assert "error: " in capsys.readouterr().err
