@@ -11,7 +11,7 @@ import pytest
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
-from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
+from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
@@ -74,8 +74,13 @@ def train(experiment: Experiment, steps: int):
     return variables, state, frozen, losses
 
 
-def test_lora_regime_changes_adapters_and_projection_and_nothing_else():
+@pytest.mark.parametrize("fusion", ["prefix", "adapter"])
+def test_lora_regime_changes_adapters_and_projection_and_nothing_else(fusion):
     experiment = small_experiment(regime="lora")
+    prompt = VisualPromptConfig(width=32, layers=1, heads=2, ffn=32)
+    experiment = dataclasses.replace(
+        experiment, model=dataclasses.replace(experiment.model, fusion=fusion, visual_prompt=prompt)
+    )
     before, state, frozen, losses = train(experiment, 6)
     after = join_variables(state.trainable, frozen)
     changed = {
@@ -84,6 +89,9 @@ def test_lora_regime_changes_adapters_and_projection_and_nothing_else():
         if not np.array_equal(old, new)
     }
     assert changed == {"lora", "projector"}
+    if fusion == "adapter":
+        old, new = (tree["params"]["projector"] for tree in (before, after))
+        assert all(not np.array_equal(a, b) for a, b in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True))
     assert losses[-1] < losses[0]
 
 

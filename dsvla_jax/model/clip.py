@@ -74,9 +74,10 @@ def over_layers(block, config: ModelConfig, layers: int, in_axes: Any = nn.broad
 
 
 class VisionTower(nn.Module):
-    """image float32 (B, S, S, 3), point_tokens (B, G, D), point_patches int32 (B, G) -> (B, 1 + N + G, D).
+    """image float32 (B, S, S, 3), point_tokens (B, G, D), point_patches int32 (B, G) -> (B, 1 + N + G, output width).
 
-    G may be 0. The outputs are those of ``ln_post`` for every token, in the order [CLS | 2D | 3D].
+    G may be 0. The outputs are those of ``ln_post`` for every token, in the order [CLS | 2D | 3D]; with an
+    ``embed_width``, times CLIP's projection into the joint embedding.
     """
 
     config: ModelConfig
@@ -116,7 +117,11 @@ class VisionTower(nn.Module):
 
         x = layer_norm(vision.norm_eps, "ln_pre")(x).astype(dtype)
         x, _ = over_layers(VisionBlock, self.config, vision.layers)(self.config, name="layers")(x, None)
-        return layer_norm(vision.norm_eps, "ln_post")(x)
+        x = layer_norm(vision.norm_eps, "ln_post")(x)
+        if vision.embed_width is None:
+            return x
+        projection = self.param("projection", KERNEL_INIT, (vision.width, vision.embed_width))
+        return x.astype(dtype) @ projection.astype(dtype)
 
 
 class Projector(nn.Module):

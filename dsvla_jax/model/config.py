@@ -15,7 +15,11 @@ def _require(condition: bool, message: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class VisionConfig:
-    """A CLIP vision transformer; the defaults are ViT-L/14 at 336 pixels."""
+    """A CLIP vision transformer; the defaults are ViT-L/14 at 336 pixels.
+
+    embed_width: of CLIP's joint embedding of images and text (ViT-L/14: 768), to which every output is then projected,
+        as LLaMA-Adapter reads it; None for the outputs before that projection.
+    """
 
     image_size: int = 336
     patch_size: int = 14
@@ -24,6 +28,7 @@ class VisionConfig:
     heads: int = 16
     mlp_ratio: float = 4.0
     norm_eps: float = 1e-5
+    embed_width: int | None = None
 
     def __post_init__(self):
         _require(
@@ -46,6 +51,10 @@ class VisionConfig:
     @property
     def ffn(self) -> int:
         return round(self.width * self.mlp_ratio)
+
+    @property
+    def output_width(self) -> int:
+        return self.embed_width or self.width
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,6 +125,37 @@ class LanguageConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class VisualPromptConfig:
+    """LLaMA-Adapter's way from vision outputs to prompts; the defaults are ManipLLM's, which 3DS-VLA builds on.
+
+    width, layers, heads, ffn, rope_theta, norm_eps: of the visual blocks, transformer layers that see all tokens.
+    queries: 0 makes every visual token a prompt token. Otherwise so many learned queries are read with the visual
+        tokens, and only they become the prompt (LLaMA-Adapter V2: 10).
+    prompted_layers: how many of the language model's layers, counted from its end, look at a prompt; None for all.
+    """
+
+    width: int = 1024
+    layers: int = 16
+    heads: int = 8
+    ffn: int = 2816
+    rope_theta: float = 10000.0
+    norm_eps: float = 1e-5
+    queries: int = 0
+    prompted_layers: int | None = None
+
+    def __post_init__(self):
+        _require(
+            self.width % (2 * self.heads) == 0,
+            f"visual_prompt: width {self.width} must be a multiple of 2 * heads = {2 * self.heads} (rotary halves)",
+        )
+        _require(self.layers > 0, f"visual_prompt: layers must be positive, got {self.layers}")
+        _require(
+            self.queries >= 0,
+            f"visual_prompt: queries must not be negative, got {self.queries}; 0 makes every visual token a prompt",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class LoraConfig:
     """Low-rank adapters: y = x W + (alpha / rank) x A B.
 
@@ -150,7 +190,11 @@ class ModelConfig:
     """The assembled network.
 
     point_width: width of a 3D token; the vision tower's width, because 3D tokens enter it as they are. None means that.
-    projector: vision width -> language width: a "linear" layer, or an "mlp" of two with GELU; LayerNorm follows.
+    fusion: how visual tokens enter the language model. "prefix": projected, before the text, so that any model of the
+        Llama family serves. "adapter": as prompts that every layer looks at in an attention of their own, behind a
+        gate that starts closed (LLaMA-Adapter, the paper's lineage).
+    projector: of "prefix", vision -> language width: a "linear" layer, or an "mlp" of two with GELU; LayerNorm follows.
+    visual_prompt: the projection of "adapter".
     lora: None for no adapters.
     dtype: of matrix products and activations. Parameters, norms, softmax, rotations and logits are always float32.
     remat: what the backward pass computes again, a layer at a time: "none", "full" (everything) or "dots" (all but
@@ -163,7 +207,9 @@ class ModelConfig:
     vision: VisionConfig = VisionConfig()
     language: LanguageConfig = LanguageConfig()
     point_width: int | None = None
+    fusion: Literal["prefix", "adapter"] = "prefix"
     projector: Literal["linear", "mlp"] = "linear"
+    visual_prompt: VisualPromptConfig = VisualPromptConfig()
     lora: LoraConfig | None = None
     dtype: Literal["float32", "bfloat16"] = "float32"
     remat: Literal["none", "full", "dots"] = "none"
@@ -176,10 +222,28 @@ class ModelConfig:
             f"point_width {self.point_width} differs from the vision width {self.vision.width}: 3D tokens enter the "
             f"vision tower unprojected, so set the 3D tokenizer's width to {self.vision.width}",
         )
+        _require(self.fusion in ("prefix", "adapter"), f"fusion: expected 'prefix' or 'adapter', got {self.fusion!r}")
+        if self.fusion == "adapter":
+            _require(
+                self.projector == "linear",
+                f"projector {self.projector!r} belongs to fusion='prefix'; with 'adapter' the projection is "
+                "visual_prompt, so leave projector at 'linear'",
+            )
+            _require(
+                0 < self.prompted_layers <= self.language.layers,
+                f"visual_prompt: prompted_layers {self.prompted_layers} must be from 1 to the language model's "
+                f"{self.language.layers} layers",
+            )
 
     @property
     def compute_dtype(self) -> jnp.dtype:
         return jnp.dtype(self.dtype)
+
+    @property
+    def prompted_layers(self) -> int:
+        """How many of the language model's last layers look at a visual prompt with fusion="adapter"."""
+        chosen = self.visual_prompt.prompted_layers
+        return self.language.layers if chosen is None else chosen
 
     def lora_for(self, tower: str) -> LoraConfig | None:
         """The adapters of one tower, None where it has none."""

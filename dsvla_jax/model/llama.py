@@ -18,11 +18,43 @@ Array = jax.Array
 
 
 @struct.dataclass
-class KVCache:
-    """Keys (rotated) and values of every layer: (layers, B, kv_heads, S, D), S slots in order of writing."""
+class PromptTokens:
+    """The part of the visual prompts that all layers share.
+
+    tokens: (B, P, width). rows: int32 (B, P), which of a layer's own rows is added to each.
+    """
+
+    tokens: Array
+    rows: Array
+
+
+@struct.dataclass
+class LayerPrompts:
+    """The part of the visual prompts that each layer has of its own: rows (layers, R, width), gate (layers, heads)."""
+
+    rows: Array
+    gate: Array
+
+
+@struct.dataclass
+class PromptCache:
+    """Every layer's keys and values of its prompt, (layers, B, kv_heads, P, D), and gate (layers, heads)."""
 
     keys: Array
     values: Array
+    gate: Array
+
+
+@struct.dataclass
+class KVCache:
+    """Keys (rotated) and values of every layer: (layers, B, kv_heads, S, D), S slots in order of writing.
+
+    prompt: those of the visual prompts, which never change once they are there.
+    """
+
+    keys: Array
+    values: Array
+    prompt: PromptCache | None = None
 
     @classmethod
     def empty(cls, config: ModelConfig, batch: int, slots: int) -> "KVCache":
@@ -72,13 +104,25 @@ def rotate(x: Array, tables: tuple[Array, Array]) -> Array:
 
 
 class DecoderBlock(nn.Module):
-    """One layer. With a cache, keys and values are written at slot ``index`` and the queries look at all its slots."""
+    """One layer. With a cache, keys and values are written at slot ``index`` and the queries look at all its slots.
+
+    With a visual prompt the queries look at that too, in an attention with a softmax of its own, whose output is added
+    behind the gate tanh(g) of each head (Zhang et al. 2023, "LLaMA-Adapter"). A prompt's keys and values are products
+    with the base weights alone: no adapter, no norm, no rotation.
+    """
 
     config: ModelConfig
 
     @nn.compact
     def __call__(
-        self, x: Array, tables: tuple[Array, Array], mask: Array, cache: KVCache | None, index: Array | int
+        self,
+        x: Array,
+        tables: tuple[Array, Array],
+        mask: Array | None,
+        cache: KVCache | None = None,
+        index: Array | int = 0,
+        shared: PromptTokens | None = None,
+        prompt: LayerPrompts | PromptCache | None = None,
     ) -> tuple[Array, KVCache | None]:
         language, dtype = self.config.language, self.config.compute_dtype
         options = {"lora": self.config.lora_for("language"), "dtype": dtype}
@@ -87,13 +131,25 @@ class DecoderBlock(nn.Module):
 
         y = RMSNorm(language.norm_eps, name="attention_norm")(x)
         query = rotate(split_heads(LoraDense(query_width, name="q", **options)(y), language.heads), tables)
-        key = rotate(split_heads(LoraDense(kv_width, name="k", **options)(y), language.kv_heads), tables)
-        value = split_heads(LoraDense(kv_width, name="v", **options)(y), language.kv_heads)
+        to_key, to_value = (LoraDense(kv_width, name=name, **options) for name in "kv")
+        key = rotate(split_heads(to_key(y), language.kv_heads), tables)
+        value = split_heads(to_value(y), language.kv_heads)
         if cache is not None:
             key = jax.lax.dynamic_update_slice_in_dim(cache.keys, key, index, axis=2)
             value = jax.lax.dynamic_update_slice_in_dim(cache.values, value, index, axis=2)
             cache = KVCache(key, value)
-        y = join_heads(attend(query, key, value, mask, self.config.attention))
+        attended = attend(query, key, value, mask, self.config.attention)
+        if shared is not None and isinstance(prompt, LayerPrompts):
+            tokens = shared.tokens + prompt.rows.astype(dtype)[shared.rows]
+            prompt_key, prompt_value = (
+                split_heads(project(tokens, adapted=False), language.kv_heads) for project in (to_key, to_value)
+            )
+            prompt = PromptCache(prompt_key, prompt_value, prompt.gate)
+            cache = None if cache is None else cache.replace(prompt=prompt)
+        if isinstance(prompt, PromptCache):
+            gate = jnp.tanh(prompt.gate)[:, None, None].astype(dtype)
+            attended += gate * attend(query, prompt.keys, prompt.values, implementation=self.config.attention)
+        y = join_heads(attended)
         x = x + LoraDense(language.width, kernel_init=into_residual, name="o", **options)(y)
 
         y = RMSNorm(language.norm_eps, name="mlp_norm")(x)
@@ -116,7 +172,10 @@ class Llama(nn.Module):
             "embedding", nn.initializers.normal(language.width**-0.5), (language.vocab_size, language.width)
         )
         self.layers = over_layers(
-            DecoderBlock, self.config, language.layers, in_axes=(nn.broadcast, nn.broadcast, 0, nn.broadcast)
+            DecoderBlock,
+            self.config,
+            language.layers,
+            in_axes=(nn.broadcast, nn.broadcast, 0, nn.broadcast, nn.broadcast, 0),
         )(self.config)
         self.norm = RMSNorm(language.norm_eps)
         if not language.tie_embeddings:
@@ -129,14 +188,28 @@ class Llama(nn.Module):
         return self.embedding[tokens].astype(self.config.compute_dtype)
 
     def __call__(
-        self, x: Array, positions: Array, mask: Array, cache: KVCache | None = None, index: Array | int = 0
+        self,
+        x: Array,
+        positions: Array,
+        mask: Array,
+        cache: KVCache | None = None,
+        index: Array | int = 0,
+        prompts: tuple[PromptTokens, LayerPrompts] | None = None,
     ) -> tuple[Array, KVCache | None]:
         """x (B, T, width), positions int32 (B or 1, T), mask bool (B or 1, T, S) -> hidden (B, T, width), new cache.
 
         Without a cache S is T. With one, its S slots are attended to, after slots index..index+T-1 are overwritten.
+        prompts: the visual prompts, which also go into the cache; later calls find them there and need none.
         """
         tables = rotary_tables(positions, self.config.language)
-        x, cache = self.layers(x, tables, mask, cache, index)
+        shared, layer_prompts = prompts or (None, None)
+        if cache is None or cache.prompt is None:
+            x, cache = self.layers(x, tables, mask, cache, index, shared, layer_prompts)
+        else:
+            # The prompt goes beside the cache and not in it, so that the loop over layers does not write it anew.
+            cached = cache.prompt
+            x, text = self.layers(x, tables, mask, cache.replace(prompt=None), index, None, cached)
+            cache = KVCache(text.keys, text.values, cached)
         return self.norm(x).astype(self.config.compute_dtype), cache
 
     def lm_head(self, hidden: Array) -> Array:

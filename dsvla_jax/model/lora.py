@@ -37,6 +37,7 @@ class LoraDense(nn.Module):
     """y = x W + b + (alpha / rank) x A B over the last axis of x.
 
     The adapter is used when the variables hold one; merged weights have none, and run through the same module.
+    ``adapted=False`` leaves it out for one call.
     """
 
     features: int
@@ -46,7 +47,7 @@ class LoraDense(nn.Module):
     kernel_init: Initializer = KERNEL_INIT
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, x: Array, adapted: bool = True) -> Array:
         inputs = x.shape[-1]
         # Tokens are merged into one axis: of a 3D product XLA's CPU compiler would transpose the output's gradient, and
         # compute all that is fused into it again, for the kernel's gradient.
@@ -59,7 +60,7 @@ class LoraDense(nn.Module):
             y = y + bias.astype(self.dtype)
         lora = self.lora
         present = self.is_initializing() or self.has_variable("lora", "a")
-        if lora is not None and self.name in lora.targets and present:
+        if adapted and lora is not None and self.name in lora.targets and present:
             a_init = _adapter_init(lora.init)
             a = self.variable("lora", "a", lambda: a_init(self.make_rng("params"), (inputs, lora.rank), jnp.float32))
             b = self.variable("lora", "b", lambda: jnp.zeros((lora.rank, self.features), jnp.float32))
@@ -91,7 +92,18 @@ def _add_adapters(params: Mapping, adapters: Mapping, scale: float) -> dict:
 
 
 def merge_lora(variables: Mapping, lora: LoraConfig) -> dict:
-    """Add the adapters to the base weights: {"params", "lora"} -> {"params"} of the same outputs without adapters."""
+    """Add the adapters to the base weights: {"params", "lora"} -> {"params"} of the same outputs without adapters.
+
+    Raises ValueError where there is no such thing: a visual prompt's keys and values are made with the language
+    model's base weights, so with fusion "adapter" its adapters of k and v cannot be part of those.
+    """
+    in_language = variables.get("lora", {}).get("language", {}).get("layers", {})
+    if "gate" in variables["params"].get("projector", {}) and {"k", "v"} & set(in_language):
+        raise ValueError(
+            "adapters of k and v in the language model cannot be merged with fusion 'adapter': the visual prompt's "
+            "keys and values are made without them; keep the adapters apart, or train with LoraConfig(targets=...) "
+            "without k and v"
+        )
     return {"params": _add_adapters(variables["params"], variables.get("lora", {}), lora.scale)}
 
 

@@ -1,4 +1,7 @@
-"""The assembled policy network: vision tower -> projector -> visual tokens before the text -> LLaMA -> logits."""
+"""The assembled policy network: vision tower -> projection -> LLaMA over the text -> logits.
+
+Visual tokens enter LLaMA as a prefix to the text, or as prompts of its layers (``ModelConfig.fusion``).
+"""
 
 from typing import Any
 
@@ -9,7 +12,8 @@ import numpy as np
 
 from dsvla_jax.model.clip import Projector, VisionTower
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
-from dsvla_jax.model.llama import KVCache, Llama
+from dsvla_jax.model.llama import KVCache, LayerPrompts, Llama, PromptTokens
+from dsvla_jax.model.visual_prompt import VisualPrompt
 from dsvla_jax.types import ModelInputs
 
 Array = jax.Array
@@ -22,26 +26,28 @@ NUMBER_WAVELENGTHS = (4.0, 600.0)
 class VLA(nn.Module):
     """``VLA(config).apply(variables, inputs)`` with batched ``ModelInputs`` -> float32 logits (B, T, V).
 
-    The language model reads [visual tokens | text], all causal. Logits are returned for the text positions: position t
-    predicts text token t + 1. Text is padded at its end, so causality alone keeps padding out of every valid position.
+    The language model reads [visual tokens | text], all causal; with fusion "adapter" the text alone, and each layer
+    its visual prompt. Logits are returned for the text positions: position t predicts text token t + 1. Text is padded
+    at its end, so causality alone keeps padding out of every valid position.
     """
 
     config: ModelConfig
 
     def setup(self):
         self.vision = VisionTower(self.config)
-        self.projector = Projector(self.config)
+        # Both are the paper's projection module, and have one name, under which regimes and checkpoints know it.
+        self.projector = VisualPrompt(self.config) if self.config.fusion == "adapter" else Projector(self.config)
         self.language = Llama(self.config)
 
     def encode_vision(self, inputs: ModelInputs) -> Array:
-        """The vision tower's outputs (B, 1 + N + G, vision width), ordered [CLS | 2D | 3D]."""
+        """The vision tower's outputs (B, 1 + N + G, vision output width), ordered [CLS | 2D | 3D]."""
         return self.vision(inputs.image, inputs.point_tokens, inputs.point_patches)
 
     def hidden(self, inputs: ModelInputs, text_from: int = 0) -> Array:
         """Hidden states (B, T - text_from, width) of the text positions from ``text_from`` on."""
-        x, positions = self._sequence(inputs)
+        x, positions, prompts = self._sequence(inputs)
         mask = positions[:, :, None] >= positions[:, None, :]
-        x, _ = self.language(x, positions, mask)
+        x, _ = self.language(x, positions, mask, prompts=prompts)
         return x[:, x.shape[1] - inputs.text_tokens.shape[1] + text_from :]
 
     def lm_head(self, hidden: Array) -> Array:
@@ -53,15 +59,15 @@ class VLA(nn.Module):
         return self.lm_head(self.hidden(inputs, text_from))
 
     def prefill(self, inputs: ModelInputs, more_slots: int) -> tuple[Array, KVCache]:
-        """Read visual tokens and text into a fresh cache with ``more_slots`` unused slots at its end.
+        """Read visual tokens or prompts, and text, into a fresh cache with ``more_slots`` unused slots at its end.
 
         Returns the logits (B, V) after each example's last valid text token, and the cache.
         """
-        x, positions = self._sequence(inputs)
+        x, positions, prompts = self._sequence(inputs)
         batch, length, _ = x.shape
         cache = KVCache.empty(self.config, batch, length + more_slots)
         mask = positions[:, :, None] >= jnp.arange(length + more_slots)[None, None, :]
-        x, cache = self._continue(x, positions, mask, cache, 0)
+        x, cache = self._continue(x, positions, mask, cache, 0, prompts)
         text_lengths = inputs.text_mask.sum(axis=1)
         last = length - inputs.text_tokens.shape[1] + text_lengths - 1
         hidden = jnp.take_along_axis(x, last[:, None, None], axis=1)[:, 0]
@@ -77,13 +83,19 @@ class VLA(nn.Module):
         x, cache = self._continue(self.language.embed(tokens), positions, mask, cache, index)
         return self.lm_head(x[:, -1]), cache
 
-    def _continue(self, x: Array, positions: Array, mask: Array, cache: KVCache, index: Array | int) -> Any:
-        return self.language(x, positions, mask, cache, index)
+    def _continue(
+        self, x: Array, positions: Array, mask: Array, cache: KVCache, index: Array | int, prompts: Any = None
+    ) -> Any:
+        return self.language(x, positions, mask, cache, index, prompts)
 
-    def _sequence(self, inputs: ModelInputs) -> tuple[Array, Array]:
-        visual = self.projector(self.encode_vision(inputs))
-        x = jnp.concatenate([visual, self.language.embed(inputs.text_tokens)], axis=1)
-        return x, jnp.arange(x.shape[1])[None]
+    def _sequence(self, inputs: ModelInputs) -> tuple[Array, Array, tuple[PromptTokens, LayerPrompts] | None]:
+        """What the language model reads: (B, T', width), its positions (1, T'), and the visual prompts if any."""
+        visual, x, prompts = self.encode_vision(inputs), self.language.embed(inputs.text_tokens), None
+        if isinstance(self.projector, VisualPrompt):
+            prompts = self.projector(visual, inputs.point_patches)
+        else:
+            x = jnp.concatenate([self.projector(visual), x], axis=1)
+        return x, jnp.arange(x.shape[1])[None], prompts
 
 
 def number_embeddings(values: Array, width: int) -> Array:
