@@ -24,8 +24,10 @@ from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.loader import make_loader
 from data_pipelines.samples import make_sampler, suite_tokenizer
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.encoding.text import WordTokenizer, load_tokenizer
+from dsvla_jax.errors import UserError
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, load_policy, save_policy_config
@@ -37,6 +39,7 @@ from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
 
 def main(experiment: Experiment, run: Path, resume: bool) -> None:
     """Trains one experiment into the run folder, or goes on from its newest checkpoint."""
+    tokenizer = tokenizer_of(experiment)
     tasks = select_tasks(experiment.data.tasks)
     experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     prepare_run_folder(run, experiment, resume)
@@ -56,7 +59,6 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
         workers=os.cpu_count() or 1,
     )
     reader = EpisodeReader(Path(data.folder), tasks=data.tasks, episodes=data.episodes)
-    tokenizer = suite_tokenizer()
     sample = make_sampler(data, experiment.encoding, tokenizer)
     loader = make_loader(reader, sample, batch_size=experiment.batch_size, seed=experiment.seed)
 
@@ -100,11 +102,24 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
     print(f"trained: {run} (evaluate it with: python eval.py {run})")
 
 
+def tokenizer_of(experiment: Experiment) -> WordTokenizer:
+    """The vocabulary of the experiment, which has to be that of its language model."""
+    tokenizer = load_tokenizer(experiment.tokenizer) if experiment.tokenizer else suite_tokenizer()
+    expected = experiment.model.language.vocab_size
+    if tokenizer.vocab_size != expected:
+        raise UserError(
+            f"tokenizer: {experiment.tokenizer or 'the words of the task suite'} has {tokenizer.vocab_size} tokens, "
+            f"model.language.vocab_size is {expected}; they must be of one language model"
+        )
+    return tokenizer
+
+
 def initial_variables(experiment: Experiment, number_values: np.ndarray) -> dict[str, Any]:
     """The variables at step 0: random by the seed, or those of the base run with fresh adapters."""
     variables = jax.jit(lambda: initialize(experiment.model, jax.random.key(experiment.seed), number_values))()
     if experiment.base:
         base = load_policy(Path(experiment.base)).variables
+        require_same_shapes(base["params"], variables["params"], Path(experiment.base))
         variables = {**variables, "params": base["params"]}
     return variables
 

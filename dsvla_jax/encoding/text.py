@@ -13,6 +13,7 @@ from flax import struct
 
 from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
 from dsvla_jax.encoding.prompts import Slot, Style, answer_pieces, template_texts
+from dsvla_jax.errors import UserError
 from dsvla_jax.types import Array
 
 LOWEST_NUMBER, HIGHEST_NUMBER = -100, 200
@@ -38,6 +39,20 @@ class Tokenizer(Protocol):
     def encode(self, text: str) -> list[int]: ...
 
     def decode(self, tokens: Sequence[int]) -> str: ...
+
+
+def load_tokenizer(folder: str | pathlib.Path) -> "WordTokenizer":
+    """The tokenizer saved in a folder as tokenizer.json; raises UserError where there is none that can be read."""
+    file = pathlib.Path(folder) / "tokenizer.json"
+    if not file.exists():
+        raise UserError(
+            f"tokenizer: {file} is missing; expected the vocabulary that the language model was trained with: put it "
+            "there, or name its folder with --tokenizer"
+        )
+    try:
+        return WordTokenizer.load(file)
+    except ValueError as error:
+        raise UserError(f"tokenizer: {error}") from error
 
 
 def split_words(text: str) -> list[str]:

@@ -47,6 +47,8 @@ class Experiment:
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
     base: str = ""
     """A finished run whose parameters are the frozen base of the `lora` regime; empty: random from the seed."""
+    tokenizer: str = ""
+    """A folder with the language model's vocabulary; empty: the words of the task suite."""
     steps: int = 1000
     batch_size: int = 32
     soft_target_sigma: float = 0.0

@@ -7,17 +7,18 @@ import numpy as np
 from dsvla_jax.types import Array
 
 
-def target_distributions(number_values: np.ndarray, sigma: float) -> np.ndarray:
+def target_distributions(number_values: np.ndarray, sigma: float) -> np.ndarray | None:
     """Row t is the distribution to learn when the target token is t: float32 (V, V).
 
     One-hot for words. For the token of an integer, a Gaussian over the integers around it, `sigma` bins wide, which
-    tells the model that neighbouring bins are nearly right; `sigma` 0 keeps one-hot everywhere, as in the paper.
+    tells the model that neighbouring bins are nearly right. `sigma` 0 is the paper's one-hot everywhere, and None: with
+    the vocabulary of a real language model the table would take gigabytes.
 
     number_values: float32 (V,), NaN where a token is no integer.
     """
-    targets = np.eye(len(number_values), dtype=np.float32)
     if sigma <= 0:
-        return targets
+        return None
+    targets = np.eye(len(number_values), dtype=np.float32)
     numbers = np.flatnonzero(~np.isnan(number_values))
     values = number_values[numbers].astype(np.float64)
     weights = np.exp(-0.5 * ((values[:, None] - values[None, :]) / sigma) ** 2)
@@ -26,21 +27,22 @@ def target_distributions(number_values: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def answer_loss(
-    logits: Array, text_tokens: Array, answer_mask: Array, soft_mask: Array, targets: Array
+    logits: Array, text_tokens: Array, answer_mask: Array, soft_mask: Array, targets: Array | None
 ) -> tuple[Array, dict[str, Array]]:
     """Mean cross-entropy over all answer tokens of the batch, each predicted from the token before it.
 
     logits: float32 (B, T, V). text_tokens: int32 (B, T). answer_mask, soft_mask: bool (B, T), True on answer tokens,
     and on those of them that name a bin (a gripper status is 0 or 1 and has no neighbour that is nearly right).
-    targets: float32 (V, V), from `target_distributions`.
+    targets: float32 (V, V) or None, from `target_distributions`.
     Returns the loss and metrics: token accuracy, and the share of bins that are within one of the target's.
     """
     labels, answer, soft = text_tokens[:, 1:], answer_mask[:, 1:], soft_mask[:, 1:]
     log_probabilities = jax.nn.log_softmax(logits[:, :-1].astype(jnp.float32))
-    hard = jnp.take_along_axis(log_probabilities, labels[..., None], axis=-1)[..., 0]
-    blurred = jnp.einsum("btv,btv->bt", log_probabilities, targets[labels])
+    likelihood = jnp.take_along_axis(log_probabilities, labels[..., None], axis=-1)[..., 0]
+    if targets is not None:
+        likelihood = jnp.where(soft, jnp.einsum("btv,btv->bt", log_probabilities, targets[labels]), likelihood)
     count = jnp.maximum(answer.sum(), 1)
-    loss = -jnp.where(answer, jnp.where(soft, blurred, hard), 0.0).sum() / count
+    loss = -jnp.where(answer, likelihood, 0.0).sum() / count
 
     guess = log_probabilities.argmax(-1)
     # Integers are numbered in order in the vocabulary, so a distance in tokens is a distance in bins.

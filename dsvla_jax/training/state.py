@@ -67,7 +67,8 @@ def make_train_step(
 
     Gradients are taken with respect to the trainable variables only: frozen parameters cost no weight gradient.
     """
-    targets = jnp.asarray(target_distributions(number_values, experiment.soft_target_sigma))
+    targets = target_distributions(number_values, experiment.soft_target_sigma)
+    targets = None if targets is None else jnp.asarray(targets)
 
     def step(state: TrainState, frozen: Variables, batch: dict[str, Array]):
         inputs = model_inputs(batch, experiment.encoding)

@@ -1,0 +1,116 @@
+"""The paper's sizes by their shapes alone: nothing of 7 billion parameters is allocated."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from configs import get_config
+from dsvla_jax.encoding.text import WordTokenizer, load_tokenizer
+from dsvla_jax.errors import UserError
+from dsvla_jax.model.variables import split_variables
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+from train import tokenizer_of
+
+EXPERIMENT = get_config("paper_7b")
+
+
+@pytest.fixture(scope="module")
+def shapes() -> dict[str, Any]:
+    return jax.eval_shape(lambda: initialize(EXPERIMENT.model, jax.random.key(0)))
+
+
+def count(tree: Any) -> int:
+    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+
+
+def test_backbones_have_the_published_number_of_parameters(shapes):
+    # LLaMA-7B: 6,738,415,616. CLIP's vision model without and with its projection: 303,507,456 and 304,293,888.
+    params = shapes["params"]
+    assert count(params["language"]) == 6_738_415_616
+    assert count(params["vision"]) == 304_293_888
+    assert params["vision"]["projection"].shape == (1024, 768)
+    assert count(params["vision"]) - 1024 * 768 == 303_507_456
+
+
+def test_what_learns_by_name(shapes):
+    trainable, frozen = split_variables(shapes, EXPERIMENT.regime)
+    counts = {f"lora/{tower}": count(tree) for tower, tree in trainable["lora"].items()}
+    counts |= {name: count(tree) for name, tree in trainable["params"]["projector"].items()}
+    assert counts == {
+        "lora/language": 32 * 16 * (4 * (4096 + 4096) + 3 * (4096 + 11008)),  # 39.98 M
+        "lora/vision": 24 * 16 * (4 * (1024 + 1024) + 2 * (1024 + 4096)),  # 7.08 M
+        "clip_proj": 768 * 1024 + 1024,
+        "clip_proj_norm": 2 * 1024,  # 0.79 M with the layer before
+        "visual_blocks": 16 * (4 * 1024**2 + 3 * 1024 * 2816 + 2 * 1024),
+        "visual_blocks_norm": 1024,
+        "visual_blocks_output": 1024**2,  # 206.6 M with the two before
+        "visual_proj": 1024 * 4096 + 4096,
+        "visual_proj_norm": 2 * 4096,  # 4.21 M with the layer before
+        "adapter_query": 32 * 577 * 4096,  # 75.6 M
+        "gate": 32 * 32,
+    }
+    assert set(trainable["params"]) == {"projector"}
+    assert set(frozen) == {"params"}
+    assert set(frozen["params"]) == {"vision", "language"}
+    assert count(trainable) == 334_283_776
+
+
+def test_training_step_has_consistent_shapes(shapes):
+    trainable, frozen = split_variables(shapes, EXPERIMENT.regime)
+    optimizer = make_optimizer(EXPERIMENT.optimizer, EXPERIMENT.steps)
+    vocabulary = np.full(EXPERIMENT.model.language.vocab_size, np.nan, np.float32)
+    step = make_train_step(EXPERIMENT, VLA(EXPERIMENT.model), optimizer, vocabulary)
+    start: Any = jax.ShapeDtypeStruct((), jnp.int32)
+    state = TrainState(start, trainable, jax.eval_shape(optimizer.init, trainable))
+    size, text = EXPERIMENT.data.image_size, EXPERIMENT.encoding.max_text_length
+    batch = {
+        name: jax.ShapeDtypeStruct((EXPERIMENT.batch_size, *shape), dtype)
+        for name, shape, dtype in (
+            ("rgb", (size, size, 3), jnp.uint8),
+            ("depth", (size, size), jnp.float32),
+            ("intrinsics", (3, 3), jnp.float32),
+            ("world_from_camera", (4, 4), jnp.float32),
+            ("text_tokens", (text,), jnp.int32),
+            ("text_mask", (text,), bool),
+            ("answer_mask", (text,), bool),
+            ("soft_mask", (text,), bool),
+        )
+    }
+    after, metrics = jax.eval_shape(step, state, frozen, batch)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+    assert metrics["loss"].shape == ()
+
+
+def test_the_papers_settings():
+    encoding, optimizer = EXPERIMENT.encoding, EXPERIMENT.optimizer
+    assert (encoding.image_size, encoding.points.num_points, encoding.points.num_tokens) == (336, 2048, 576)
+    assert (encoding.points.width, encoding.points.neighbours) == (1024, 16)
+    assert (encoding.style, encoding.alignment, encoding.max_text_length) == ("paper", "aligned", 512)
+    assert EXPERIMENT.soft_target_sigma == 0
+    np.testing.assert_allclose(optimizer.learning_rate, 1.17e-6, rtol=2e-3)
+    # Neither warm-up nor clipping: the first update has the full rate, whatever the gradient's size.
+    transform = make_optimizer(optimizer, EXPERIMENT.steps)
+    weights = {"gate": jnp.zeros(3)}
+    updates: Any = transform.update({"gate": jnp.full(3, 1e6)}, transform.init(weights), weights)[0]
+    np.testing.assert_allclose(updates["gate"], -optimizer.learning_rate, rtol=1e-4)
+
+
+def test_a_missing_or_foreign_vocabulary_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"tokenizers/llama/tokenizer\.json is missing; .*--tokenizer"):
+        tokenizer_of(EXPERIMENT)
+    folder = tmp_path / "tokenizers" / "llama"
+    folder.mkdir(parents=True)
+    tokenizer = WordTokenizer(("a", "b"))
+    tokenizer.save(folder / "tokenizer.json")
+    assert load_tokenizer(folder) == tokenizer
+    with pytest.raises(UserError, match=f"has {tokenizer.vocab_size} tokens, .* is 32000"):
+        tokenizer_of(EXPERIMENT)
+    (folder / "tokenizer.json").write_text('{"model": {"type": "BPE"}}')
+    with pytest.raises(UserError, match=r"tokenizer: .*expected a JSON object with format"):
+        tokenizer_of(EXPERIMENT)
