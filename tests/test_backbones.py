@@ -110,6 +110,12 @@ def test_clip_without_3d_tokens_is_that_of_transformers(folders, name):
     assert_close(run_clip(tower, size), ARRAYS[f"{name}.output_{size}"])
 
 
+def test_clip_with_its_projection_is_that_of_transformers():
+    tower = read_vision(GOLDEN / "clip", projection=True)
+    assert not [key for key in tower.unused if "text" not in key and key != "logit_scale"]
+    assert_close(run_clip(tower, 9), ARRAYS["clip.projected_9"])
+
+
 @pytest.mark.parametrize(("name", "size"), [(name, size) for name, sizes in RESAMPLED_TO.items() for size in sizes])
 def test_clip_at_another_image_size_is_that_of_transformers(folders, name, size):
     assert_close(run_clip(read_vision(folders[name], size), size), ARRAYS[f"{name}.output_{size}"])

@@ -234,6 +234,10 @@ def test_vision_sources_that_do_not_fit(tmp_path):
     with pytest.raises(WeightsError, match=r"image size 10 .* image_size 10 is not a multiple of patch_size 3"):
         read_vision(GOLDEN / "clip", 10)
     folder = write_checkpoint(tmp_path / "source", CASES["odd_grid"]["config"], case_tensors("plain"))
+    with pytest.raises(WeightsError, match=r"visual_projection.weight is missing"):
+        read_vision(
+            write_checkpoint(tmp_path / "tower", CASES["odd_grid"]["config"], case_tensors("odd_grid")), projection=True
+        )
     with pytest.raises(WeightsError, match=r"wrong architecture: .*embeddings.class_embedding, none does"):
         read_vision(folder)
     config = CASES["odd_grid"]["config"] | {"hidden_act": "gelu"}
@@ -255,7 +259,7 @@ def test_resampled_positions_keep_constants_and_the_class_token():
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory):
     out = tmp_path_factory.mktemp("imported") / "new" / "base"
-    return out, import_backbones(GOLDEN / "llama_sharded", out, GOLDEN / "clip", 15)
+    return out, import_backbones(GOLDEN / "llama_sharded", out, GOLDEN / "clip", 15, projection=True)
 
 
 def test_imported_folder_gives_back_configs_and_params(imported):

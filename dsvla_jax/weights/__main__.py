@@ -26,6 +26,7 @@ def import_command(
     vision: Path | None = None,
     image_size: int | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
+    projection: bool = False,
 ) -> None:
     """Writes the towers of Hugging Face checkpoints to a new folder, as parameters of this project's model.
 
@@ -35,8 +36,9 @@ def import_command(
         vision: folder with config.json and safetensors of a CLIP vision tower.
         image_size: resample the tower's positional embeddings to images of this many pixels.
         dtype: of the numbers on disk; bfloat16 takes half the space and memory.
+        projection: keep CLIP's projection into its joint embedding, which LLaMA-Adapter reads.
     """
-    towers = import_backbones(source, out, vision, image_size, DTYPES[dtype])
+    towers = import_backbones(source, out, vision, image_size, DTYPES[dtype], projection)
     for name, tower in towers.items():
         size = sum(leaf.size for leaf in jax.tree.leaves(tower.params))
         print(f"{name}: {size:,} parameters, {tower.config}")

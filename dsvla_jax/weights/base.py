@@ -30,19 +30,20 @@ def import_backbones(
     vision_source: Path | None = None,
     image_size: int | None = None,
     dtype: Any = np.float32,
+    projection: bool = False,
 ) -> dict[str, Tower]:
     """Reads the towers of Hugging Face folders and writes them to ``out``, a new folder, whole or not at all.
 
-    image_size: see `read_vision`. dtype: of what is kept on disk. Returns what was read, by tower. Raises WeightsError
-    where a source does not fit, CheckpointError where ``out`` exists.
+    image_size, projection: see `read_vision`. dtype: of what is kept on disk. Returns what was read, by tower.
+    Raises WeightsError where a source does not fit, CheckpointError where ``out`` exists.
     """
     if out.exists():  # told before minutes of reading
         raise CheckpointError(f"{out} exists already; remove it, or choose another folder")
-    if image_size is not None and vision_source is None:
-        raise WeightsError("an image size is of the vision tower: name the folder that has one (--vision)")
+    if vision_source is None and (image_size is not None or projection):
+        raise WeightsError("image size and projection are the vision tower's: name the folder that has one (--vision)")
     towers = {"language": read_language(source, dtype)}
     if vision_source is not None:
-        towers["vision"] = read_vision(vision_source, image_size, dtype)
+        towers["vision"] = read_vision(vision_source, image_size, dtype, projection)
     sizes = Towers(**{"vision": None} | {name: tower.config for name, tower in towers.items()})  # pyright: ignore
     save_weights(out, {name: tower.params for name, tower in towers.items()}, dataclasses.asdict(sizes))
     return towers

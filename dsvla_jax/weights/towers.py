@@ -33,6 +33,7 @@ LLAMA_NAMES = {
     **{f"layers/{name}/kernel": f"layers.{{}}.mlp.{name}_proj.weight" for name in ("gate", "up", "down")},
 }
 LM_HEAD = "lm_head.weight"
+VISUAL_PROJECTION = "visual_projection.weight"
 
 # With weight and bias each, the weight being our `kernel` or `scale`.
 _CLIP_LAYERS = {
@@ -54,7 +55,7 @@ CLIP_NAMES = {
 }
 
 # Which of the stored axes becomes each of ours: (out, in) -> (in, out), (out, in, y, x) -> (y, x, in, out).
-AXES = {"kernel": (1, 0), "output": (1, 0), "patch_kernel": (2, 3, 1, 0)}
+AXES = {"kernel": (1, 0), "output": (1, 0), "projection": (1, 0), "patch_kernel": (2, 3, 1, 0)}
 
 # Constants that old versions of transformers saved with the parameters.
 BUFFERS = ("rotary_emb.inv_freq", "embeddings.position_ids")
@@ -88,16 +89,24 @@ def read_language(folder: Path, dtype: Any = np.float32) -> Tower:
     return Tower(config, params, unused)
 
 
-def read_vision(folder: Path, image_size: int | None = None, dtype: Any = np.float32) -> Tower:
+def read_vision(
+    folder: Path, image_size: int | None = None, dtype: Any = np.float32, projection: bool = False
+) -> Tower:
     """The CLIP vision tower of a checkpoint: params of `dsvla_jax.model.clip.VisionTower` in ``dtype``.
 
     image_size: pixels; None for the checkpoint's own. Positional embeddings are resampled to another size's grid.
+    projection: read the projection into CLIP's joint embedding too, which only whole CLIP models have.
     Raises WeightsError as `read_language` does.
     """
     config = read_vision_config(folder)
     tensors = list_tensors(folder)
     prefix = _find_prefix(tensors, CLIP_NAMES["class_embedding"], folder)
     names = {ours: prefix + theirs for ours, theirs in CLIP_NAMES.items()}
+    if projection:
+        key = names["projection"] = prefix.removesuffix("vision_model.") + VISUAL_PROJECTION
+        if key not in tensors:
+            raise WeightsError(f"{folder}: {key} is missing: this is a vision tower without CLIP's projection")
+        config = dataclasses.replace(config, embed_width=tensors[key].shape[0])
     params, unused = _fill(tower_shapes(config), names, tensors, prefix, (), dtype)
     if image_size is not None and image_size != config.image_size:
         try:

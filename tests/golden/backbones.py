@@ -165,7 +165,9 @@ def main() -> None:
         vision = CLIPVisionConfig(**small, image_size=9, patch_size=3)
         clip = fill(CLIPModel(CLIPConfig(text_config=text.to_dict(), vision_config=vision.to_dict(), projection_dim=8)))
         clip.to(torch.float16).save_pretrained(HERE / "clip")
-        arrays["clip.output_9"] = vision_outputs(clip.to(torch.float32).vision_model, draw_image(9), False)
+        output = vision_outputs(clip.to(torch.float32).vision_model, draw_image(9), False)
+        projected = clip.visual_projection(torch.from_numpy(output)).numpy()
+        arrays.update({"clip.output_9": output, "clip.projected_9": projected})
 
     (HERE / "backbones.json").write_text(json.dumps(cases) + "\n")
     np.savez_compressed(HERE / "backbones.npz", **arrays)
