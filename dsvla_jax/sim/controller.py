@@ -29,7 +29,8 @@ from dsvla_jax.types import Action, Array
 WAYPOINTS = 8
 WAYPOINT_ITERATIONS, LAST_ITERATIONS = 6, 20  # of inverse kinematics, each from the waypoint before
 MOVE_STEPS, SETTLE_STEPS, GRIPPER_STEPS = 90, 20, 40
-KEYFRAME_STEPS = MOVE_STEPS + SETTLE_STEPS + GRIPPER_STEPS
+GRIP = MOVE_STEPS + SETTLE_STEPS  # the step at which the grippers begin to move
+KEYFRAME_STEPS = GRIP + GRIPPER_STEPS
 GRASP_MARGIN = 0.01  # metres around a graspable's box within which the tool centre point counts as on it
 OPEN_THRESHOLD = 0.9  # RLBench: a gripper is open if its fingers are beyond 90% of their travel
 
@@ -90,23 +91,21 @@ def joint_targets(knots: Array) -> Array:
 
 
 class Plan(NamedTuple):
-    """controls: float32 (KEYFRAME_STEPS, nu). eq_active: bool (KEYFRAME_STEPS, neq). ok: bool (), False if a pose is
-    out of reach, and then the controls hold still. closing: bool (A,), the grippers that go from open to closed."""
+    """controls: float32 (KEYFRAME_STEPS, nu). ok: bool (), False if a pose is out of reach, and then the controls hold
+    still. opening, closing: bool (A,), the grippers that are told to open, and those that go from open to closed."""
 
     controls: Array
-    eq_active: Array
     ok: Array
+    opening: Array
     closing: Array
 
 
-def plan(ctrl: Array, eq_active: Array, action: Action, arms: Sequence[Arm], welds: np.ndarray) -> Plan:
-    """Plans one keyframe of all arms.
+def plan(ctrl: Array, action: Action, arms: Sequence[Arm]) -> Plan:
+    """Plans one keyframe of all arms; nothing in it depends on the task.
 
     Args:
         ctrl: float32 (nu,), the controls in force; the path starts from the posture that they command.
-        eq_active: bool (neq,), the constraints in force.
-        action: pose (A, 7), gripper_open (A,).
-        arms: A arms. welds: int (A, number of graspables), ids of the equality constraints between hand and object.
+        action: pose (A, 7), gripper_open (A,). arms: A arms.
     """
     commanded = ctrl[_stack(arms, "actuators")]  # (A, 7)
     knots, reached = jax.vmap(plan_joints)(commanded, action.pose, jnp.asarray(_stack(arms, "base")))
@@ -118,17 +117,22 @@ def plan(ctrl: Array, eq_active: Array, action: Action, arms: Sequence[Arm], wel
     gripper = jnp.where(opens, robot.GRIPPER_OPEN_CONTROL, robot.GRIPPER_CLOSED_CONTROL)
 
     controls = jnp.broadcast_to(ctrl, (KEYFRAME_STEPS, *ctrl.shape))
-    actives = jnp.broadcast_to(eq_active, (KEYFRAME_STEPS, *eq_active.shape))
-    grip = MOVE_STEPS + SETTLE_STEPS
     for i, arm in enumerate(arms):
         controls = controls.at[:MOVE_STEPS, arm.actuators].set(targets[i])
         controls = controls.at[MOVE_STEPS:, arm.actuators].set(knots[i, -1])
-        controls = controls.at[grip:, arm.gripper].set(gripper[i])
-        if welds.size:
-            actives = actives.at[grip:, welds[i]].set(actives[grip:, welds[i]] & ~opens[i])
-    controls = jnp.where(ok, controls, ctrl)
-    actives = jnp.where(ok, actives, eq_active)
-    return Plan(controls, actives, ok, ok & was_open & ~opens)
+        controls = controls.at[GRIP:, arm.gripper].set(gripper[i])
+    return Plan(jnp.where(ok, controls, ctrl), ok, ok & opens, ok & was_open & ~opens)
+
+
+def release_schedule(eq_active: Array, opening: Array, welds: np.ndarray) -> Array:
+    """Which constraints hold at each step: opening grippers let go of what they hold before they open.
+
+    eq_active bool (neq,) now, opening bool (A,), welds int (A, number of graspables) -> bool (KEYFRAME_STEPS, neq).
+    """
+    actives = jnp.broadcast_to(eq_active, (KEYFRAME_STEPS, *eq_active.shape))
+    for opens, mine in zip(opening, welds, strict=True):
+        actives = actives.at[GRIP:, mine].set(actives[GRIP:, mine] & ~opens)
+    return actives
 
 
 def hand_pose(tool_pose: Array) -> Array:

@@ -72,8 +72,7 @@ class Environment:
         self._expert = jax.jit(jax.vmap(lambda state: self.task.expert(self.view(state))))
         if physics == "mujoco":
             stepper = physics_module.mujoco_stepper(self.scene.mj_model, resize="instance" in self.shifts)
-            plan, attach = jax.jit(jax.vmap(self._plan_one)), jax.jit(jax.vmap(self._attach_one))
-            self._execute = self._execute_on(plan, stepper, attach)
+            self._execute = self._execute_on(stepper, jax.jit)
         elif physics == "mjx":
             stepper = physics_module.mjx_stepper(self.scene.mj_model, resize="instance" in self.shifts)
             self.mjx_model, self.execute_in_mjx = stepper.mjx_model, self._execute_mjx(stepper)
@@ -210,10 +209,13 @@ class Environment:
         right = jnp.ones_like(ever) if self.task.targets is None else self.task.targets(view)
         return jnp.any(ever & ~right), jnp.any(ever & right) & ~jnp.any(view.held & right)
 
-    def _plan_one(self, state: SimState, action: Action) -> controller.Plan:
-        return controller.plan(state.ctrl, state.eq_active, action, self._arms, self._welds)
+    def _plan_one(self, ctrl: Array, action: Action) -> controller.Plan:
+        return controller.plan(ctrl, action, self._arms)
 
-    def _attach_one(self, state: SimState, plan: controller.Plan) -> SimState:
+    def _release_one(self, eq_active: Array, opening: Array) -> Array:
+        return controller.release_schedule(eq_active, opening, self._welds)
+
+    def _attach_one(self, state: SimState, ok: Array, closing: Array) -> SimState:
         poses, _ = controller.end_effector(state.qpos, self._arms)
         view = self.view(state)
         bodies = [view.body_pose(graspable.body) for graspable in self.task.graspables]
@@ -221,7 +223,7 @@ class Environment:
             state.eq_active,
             state.eq_data,
             poses,
-            plan.closing,
+            closing,
             jnp.stack(bodies) if bodies else jnp.zeros((0, 7)),
             self._half_extents,
             self._centres,
@@ -236,21 +238,25 @@ class Environment:
             eq_active=eq_active,
             eq_data=eq_data,
             grasped=state.grasped.at[self._welds].max(eq_active[self._welds]),
-            ik_failed=state.ik_failed | ~plan.ok,
+            ik_failed=state.ik_failed | ~ok,
         )
 
-    def _execute_on(self, plan_batch: Any, stepper: Any, attach_batch: Any) -> Callable[[SimState, Action], SimState]:
+    def _execute_on(self, stepper: Any, jit: Callable[[Any], Any]) -> Callable[[SimState, Action], SimState]:
+        # Apart from the rest, the plan is one program for all tasks, which is compiled once and then found on disk.
+        plan_batch = jit(jax.vmap(self._plan_one))
+        release_batch, attach_batch = jit(jax.vmap(self._release_one)), jit(jax.vmap(self._attach_one))
+
         def execute(state: SimState, action: Action) -> SimState:
-            plan = plan_batch(state, action)
-            state = stepper(state, plan.controls, self._judge, plan.eq_active)
-            return attach_batch(state, plan)
+            plan = plan_batch(state.ctrl, action)
+            state = stepper(state, plan.controls, self._judge, release_batch(state.eq_active, plan.opening))
+            return attach_batch(state, plan.ok, plan.closing)
 
         return execute
 
     def _execute_mjx(self, stepper: physics_module.MjxStepper) -> Callable[[Any, SimState, Action], SimState]:
         def execute(mjx_model: Any, state: SimState, action: Action) -> SimState:
             run = functools.partial(stepper, mjx_model=mjx_model)
-            return self._execute_on(jax.vmap(self._plan_one), run, jax.vmap(self._attach_one))(state, action)
+            return self._execute_on(run, jit=lambda function: function)(state, action)
 
         return execute
 
