@@ -4,6 +4,7 @@ Every episode starts from a seed that no demonstration used. Prints success rate
 in RUN/eval, one line of JSON an episode and an HTML report with a film strip of each.
 """
 
+import contextlib
 import dataclasses
 import sys
 import time
@@ -133,14 +134,15 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
         for start in range(0, episodes, size):
             # The last batch is filled up with further episodes: another size would compile again.
             keys = episode_keys(options.seed, "eval", name, start, size)
-            if start == 0:
-                with first_use(f"{name} {options.physics} x {size}", bar.set_postfix_str):
-                    keypoints = environment.keypoints(environment.reset(keys))
+            told = first_use(f"{name} {options.physics} x {size}", bar.set_postfix_str)
+            with told if start == 0 else contextlib.nullcontext():
+                state = environment.reset(keys)
+                keypoints = environment.keypoints(state)
             noise = np.random.default_rng([options.seed, start]).uniform(-1, 1, keypoints.shape)
             endings += run_episodes(
                 environment,
                 policy.act,
-                keys,
+                state,
                 noise=noise * options.keypoint_noise,
                 on_keyframe=lambda done, succeeded: bar.set_postfix_str(
                     f"key pose {done}, {succeeded}/{size} succeeded"

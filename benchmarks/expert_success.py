@@ -17,7 +17,6 @@ import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.types import Action
@@ -34,26 +33,18 @@ class Options:
     """Test conditions (see dsvla_jax.sim.shifts) under which to look at the experts; no rate is required of them."""
 
 
-def follow(environment: Environment, state: SimState, plan: Action) -> list[SimState]:
-    """The states at the start and after each key pose of a plan (B, M, A, ...)."""
-    states = [state]
-    for m in range(plan.pose.shape[1]):
-        states.append(environment.execute(states[-1], Action(plan.pose[:, m], plan.gripper_open[:, m])))
-    return states
-
-
 def run_expert(environment: Environment, keys: jax.Array, film: Path | None = None) -> dict[str, np.ndarray]:
     """Which episodes succeed: by the expert, at reset, after the arms have been told to stay, and, where the task has
     variations, by the expert of another one."""
     start = environment.reset(keys)
     pose, gripper = environment.end_effector(start)
     stay = Action(jnp.repeat(pose[:, None], 3, 1), jnp.repeat(gripper[:, None], 3, 1))
-    states = follow(environment, start, environment.expert(start))
-    ends = {"expert": states[-1], "at reset": start, "idle": follow(environment, start, stay)[-1]}
+    states = environment.follow(start, environment.expert(start))
+    ends = {"expert": states[-1], "at reset": start, "idle": environment.follow(start, stay)[-1]}
     count = environment.task.variations
     if count > 1 and environment.task.exclusive:
         other = start.replace(variation=(start.variation + 1 + jnp.arange(len(keys)) % (count - 1)) % count)
-        ends["wrong variation"] = follow(environment, start, environment.expert(other))[-1]
+        ends["wrong variation"] = environment.follow(start, environment.expert(other))[-1]
     if film:
         film.mkdir(parents=True, exist_ok=True)
         pictures = np.stack([np.asarray(environment.observe(s).rgb)[:4] for s in states], axis=1)

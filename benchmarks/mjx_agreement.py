@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from benchmarks.expert_success import follow
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
@@ -37,7 +36,7 @@ def compare(name: str, episodes: int) -> dict[str, float | str]:
     start = jax.tree.map(jnp.asarray, reference.reset(episode_keys(0, "validation", name, 0, episodes)))
     plan = reference.expert(start)
     began = time.monotonic()
-    outcomes = [np.asarray(env.success(follow(env, start, plan)[-1])) for env in (reference, environment)]
+    outcomes = [np.asarray(env.success(env.follow(start, plan)[-1])) for env in (reference, environment)]
     first, second = outcomes
     return {
         "task": name,

@@ -30,7 +30,6 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.types import Action, Array
@@ -106,7 +105,9 @@ class ScriptedExpert:
             state = environment.execute(
                 state, Action(pose=jnp.asarray(missed[:, m]), gripper_open=jnp.asarray(grippers[:, m]))
             )
-        replayed = self._replay(start_state, plan)
+        # Success after so many key poses of the plan, none of them missed: bool (B, M + 1).
+        unmissed = environment.follow(start_state, plan)
+        replayed = np.stack([np.asarray(environment.success(after)) for after in unmissed], axis=1)
         positions = np.stack([observation.pose[..., :3] for observation in observations], axis=1)
         active = np.asarray(self._replay_latch(positions, keypoints))
         good = np.asarray(environment.success(state)) & ~np.asarray(state.ik_failed) & ~np.asarray(state.diverged)
@@ -137,14 +138,6 @@ class ScriptedExpert:
                 )
             )
         return episodes
-
-    def _replay(self, state: SimState, plan: Action) -> np.ndarray:
-        """bool (B, M + 1): success after so many key poses of the plan, none of them missed."""
-        success = [np.asarray(self.environment.success(state))]
-        for m in range(plan.pose.shape[1]):
-            state = self.environment.execute(state, Action(plan.pose[:, m], plan.gripper_open[:, m]))
-            success.append(np.asarray(self.environment.success(state)))
-        return np.stack(success, axis=1)
 
     def _misses(self, rng: np.random.Generator, frames: int) -> np.ndarray:
         """How far each key pose is missed, float (M, 1, 3) metres.

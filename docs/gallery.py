@@ -10,19 +10,16 @@ import sys
 from pathlib import Path
 
 import cv2
-import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from benchmarks.expert_success import follow
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
 from dsvla_jax.report import film_strip
 from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.scene import build_scene
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import TASKS, StateView, Task, select_tasks
+from dsvla_jax.sim.tasks import TASKS, Task, select_tasks
 
 SIZE, CANDIDATES = 224, 3  # pixels; episodes of which the first that succeeds is drawn
 DOCS = Path(__file__).parent
@@ -59,7 +56,7 @@ def draw(name: str) -> Path:
     environment = Environment(name, image_size=SIZE)
     keys = episode_keys(1, "validation", name, 0, CANDIDATES)
     start = environment.reset(keys, variation=jnp.zeros(CANDIDATES, jnp.int32))
-    states = follow(environment, start, environment.expert(start))
+    states = environment.follow(start, environment.expert(start))
     succeeded = np.asarray(environment.success(states[-1]))
     if not succeeded.any():
         raise UserError(
@@ -73,24 +70,18 @@ def draw(name: str) -> Path:
     return path
 
 
-def number_of_key_poses(task: Task) -> int:
-    scene = build_scene(task)
-
-    def expert(key: jax.Array):
-        placed = scene.place(task.sample(key, jnp.int32(0)))
-        nothing = jnp.zeros((task.num_arms, len(task.graspables)), bool)
-        placement = (placed.qpos, placed.mocap_pos, placed.mocap_quat)
-        return task.expert(StateView(*placement, nothing, jnp.int32(0), scene.layout))
-
-    return jax.eval_shape(expert, jax.random.key(0)).pose.shape[0]
-
-
 def row(task: Task) -> str:
     words = sys.modules[f"dsvla_jax.sim.tasks.{task.name}"].__doc__ or ""
     meaning = re.sub(r"\s*RLBench[^:]*: \w+\.$", "", words.split("\n")[0])
     picture = f"images/tasks/{task.name}.png"
     shown = f"![{task.name}: at the start and at success]({picture})" if (DOCS / picture).exists() else ""
-    cells = (shown, f"`{task.name}`<br>{meaning}", f'"{task.say(0)}"', task.variations, number_of_key_poses(task))
+    cells = (
+        shown,
+        f"`{task.name}`<br>{meaning}",
+        f'"{task.say(0)}"',
+        task.variations,
+        Environment(task).expert_keyframes,
+    )
     return "| " + " | ".join(map(str, cells)) + " |"
 
 

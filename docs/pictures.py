@@ -10,7 +10,6 @@ from dsvla_jax.data_config import DataConfig
 from dsvla_jax.report import film_strip, mark_targets
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.types import Action
 
 SIZE, COLUMNS = 224, 5
 
@@ -20,12 +19,9 @@ def demonstration(name: str) -> np.ndarray:
     environment = Environment(name, image_size=SIZE)
     state = environment.reset(episode_keys(1, "validation", name, 0, 1))
     plan = environment.expert(state)
-    frames = []
-    for m in range(plan.pose.shape[1]):
-        picture = np.asarray(environment.observe(state).rgb[0])
-        frames.append(mark_targets(picture, plan.pose[0, m, :, :3], environment.camera))
-        state = environment.execute(state, Action(plan.pose[:, m], plan.gripper_open[:, m]))
-    frames.append(np.asarray(environment.observe(state).rgb[0]))
+    frames = [np.asarray(environment.observe(s).rgb[0]) for s in environment.follow(state, plan)]
+    targets = np.asarray(plan.pose[0, :, :, :3])
+    frames[:-1] = [mark_targets(f, t, environment.camera) for f, t in zip(frames[:-1], targets, strict=True)]
     frames += [np.full_like(frames[0], 255)] * (COLUMNS - len(frames))
     return film_strip(frames)
 

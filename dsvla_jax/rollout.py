@@ -12,7 +12,7 @@ import numpy as np
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
-from dsvla_jax.types import Action, Array, Camera, Observation
+from dsvla_jax.types import Action, Camera, Observation
 
 Act = Callable[[Observation, Sequence[str], np.ndarray], tuple[Action, Sequence[str]]]
 
@@ -39,19 +39,18 @@ class Ending:
 def run_episodes(
     environment: Environment,
     act: Act,
-    keys: Array,
+    state: SimState,
     limit: int | None = None,
     noise: np.ndarray | float = 0.0,
     on_keyframe: Callable[[int, int], None] = lambda done, succeeded: None,
 ) -> list[Ending]:
-    """Runs one episode a key to its end, side by side.
+    """Runs the episodes of a reset state to their ends, side by side.
 
     limit: key poses after which an episode is over; twice the expert's if not given.
     noise: metres added to the keypoints, (B, A, K, 3) or a number.
     on_keyframe: told the number of key poses done and of successes so far.
     """
-    batch = len(keys)
-    state = environment.reset(keys)
+    batch = state.qpos.shape[0]
     instructions = environment.instructions(state, np.arange(batch))
     keypoints = (np.asarray(environment.keypoints(state)) + noise).astype(np.float32)
     latched = np.zeros(keypoints.shape[:2], np.int32)
@@ -59,7 +58,7 @@ def run_episodes(
     answers: list[list[str]] = [[] for _ in range(batch)]
     targets: list[list[np.ndarray]] = [[] for _ in range(batch)]
     over = has_ended(state)
-    for done in range(1, (limit or environment.keyframe_limit(state)) + 1):
+    for done in range(1, (limit or 2 * environment.expert_keyframes) + 1):
         if over.all():
             break
         observation = environment.observe(state)

@@ -14,6 +14,7 @@ from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, Visi
 from dsvla_jax.model.decode import decode_actions, make_decoder
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
+from tests.decoding import check_padding_and_batch_mates
 
 TOKENIZER = WordTokenizer(vocabulary([]))
 VOCAB = TOKENIZER.vocab_size
@@ -102,24 +103,9 @@ def test_prefill_and_extend_give_the_logits_of_the_full_forward_pass(variables):
 
 
 def test_padding_and_batch_mates_never_change_an_answer(variables):
-    grammar, prompts = make_grammar(), make_prompts()
-    decode = make_decoder(VLA(CONFIG), grammar)
-    tokens, log_probs = decode(variables, prompts)
-    for b, length in list(enumerate(PROMPT_LENGTHS))[1:]:
-        alone = jax.tree.map(lambda x, b=b: x[b : b + 1], prompts)
-        alone = dataclasses.replace(
-            alone, text_tokens=alone.text_tokens[:, :length], text_mask=alone.text_mask[:, :length]
-        )
-        lonely_tokens, lonely_log_probs = decode(variables, alone)
-        np.testing.assert_array_equal(lonely_tokens[0], tokens[b])
-        np.testing.assert_allclose(lonely_log_probs[0], log_probs[b], atol=1e-4)
-    # What stands in the padding is never read.
-    scribbled = dataclasses.replace(prompts, text_tokens=jnp.where(prompts.text_mask, prompts.text_tokens, 3))
-    np.testing.assert_array_equal(decode(variables, scribbled)[1], log_probs)
-    # Other batch-mates, same shapes: the very same numbers.
-    others = jax.tree.map(lambda x, y: x.at[1:].set(y[1:]), prompts, make_prompts(seed=5))
-    np.testing.assert_array_equal(decode(variables, others)[0][0], tokens[0])
-    np.testing.assert_array_equal(decode(variables, others)[1][0], log_probs[0])
+    check_padding_and_batch_mates(
+        CONFIG, make_grammar(), variables, make_prompts(), make_prompts(seed=5), PROMPT_LENGTHS
+    )
 
 
 @pytest.mark.parametrize("style", STYLES)

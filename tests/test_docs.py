@@ -7,7 +7,6 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.expert_success import follow
 from dsvla_jax.sim.episode import Environment
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -20,7 +19,7 @@ def test_the_example_of_a_new_task_works():
     environment = Environment(names["TASK"], image_size=32)
     start = environment.reset(jax.random.split(jax.random.key(0), 2))
     assert not np.asarray(environment.success(start)).any()
-    assert np.asarray(environment.success(follow(environment, start, environment.expert(start))[-1])).all()
+    assert np.asarray(environment.success(environment.follow(start, environment.expert(start))[-1])).all()
 
 
 @pytest.mark.parametrize("page", [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"], ids=lambda page: page.name)

@@ -9,6 +9,7 @@ import pytest
 
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action
 
@@ -36,17 +37,21 @@ def follow(plan: Action):
     return act
 
 
+def start_of(task: str) -> SimState:
+    return environment(task).reset(keys_of(task))
+
+
 def plan_of(task: str) -> Action:
-    return environment(task).expert(environment(task).reset(keys_of(task)))
+    return environment(task).expert(start_of(task))
 
 
 def reasons(task: str, plan: Action) -> list[str]:
-    return [ending.reason for ending in run_episodes(environment(task), follow(plan), keys_of(task))]
+    return [ending.reason for ending in run_episodes(environment(task), follow(plan), start_of(task))]
 
 
 def test_an_episode_ends_with_its_success():
     plan = plan_of("put_rubbish_in_bin")
-    endings = run_episodes(environment("put_rubbish_in_bin"), follow(plan), keys_of("put_rubbish_in_bin"))
+    endings = run_episodes(environment("put_rubbish_in_bin"), follow(plan), start_of("put_rubbish_in_bin"))
     for ending in endings:
         assert ending.success
         assert ending.reason == ""
@@ -57,7 +62,7 @@ def test_an_episode_ends_with_its_success():
 
 def test_each_failure_has_its_reason():
     task = "put_rubbish_in_bin"
-    plan, start = plan_of(task), environment(task).reset(keys_of(task))
+    plan, start = plan_of(task), start_of(task)
     nothing = Action(plan.pose[:, :1], plan.gripper_open[:, :1])
     assert reasons(task, nothing) == ["time-out"] * EPISODES
 
@@ -80,7 +85,7 @@ def test_episodes_end_alike_in_mjx(task, shifts):
     for physics in ("mujoco", "mjx"):
         env = Environment(task, physics, image_size=32, shifts=shifts)
         start = env.reset(keys_of(task))
-        ends[physics] = run_episodes(env, follow(env.expert(start)), keys_of(task))
+        ends[physics] = run_episodes(env, follow(env.expert(start)), start)
         ends[physics, "start"] = np.asarray(start.qpos)
     np.testing.assert_allclose(ends["mujoco", "start"], ends["mjx", "start"], atol=1e-3)
     assert [end.success for end in ends["mujoco"]] == [end.success for end in ends["mjx"]]
@@ -95,5 +100,5 @@ def test_noise_moves_the_keypoints_that_the_policy_is_told():
         return Action(observation.pose, observation.gripper_open), [""] * EPISODES
 
     for noise in (0.0, 0.05):
-        run_episodes(environment("lamp_on"), act, keys_of("lamp_on"), limit=1, noise=noise)
+        run_episodes(environment("lamp_on"), act, start_of("lamp_on"), limit=1, noise=noise)
     np.testing.assert_allclose(told[1] - told[0], 0.05, atol=1e-6)

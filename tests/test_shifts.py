@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.expert_success import follow
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.episode import Environment
@@ -65,7 +64,7 @@ def test_other_instances_keep_their_footing_and_the_expert_succeeds():
     heights = jax.vmap(lambda s: env.view(s).body_pose("rubbish")[2])(state)
     np.testing.assert_allclose(heights - TABLE_HEIGHT, sizes[:, 2], atol=2e-3)
     plan = env.expert(state)
-    assert np.asarray(env.success(follow(env, state, plan)[-1])).sum() >= EPISODES - 1
+    assert np.asarray(env.success(env.follow(state, plan)[-1])).sum() >= EPISODES - 1
 
 
 def test_clutter_stands_on_the_table_in_view():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.expert_success import follow, run_expert
+from benchmarks.expert_success import run_expert
 from benchmarks.robustness import torment
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
@@ -76,7 +76,7 @@ def test_a_tower_of_too_few_blocks_or_of_others_is_no_success():
     others = start.replace(qpos=swapped_blocks(environment, np.array(start.qpos)))
     for state, plan in ((start, fewer), (others, environment.expert(start))):
         plan = jax.tree.map(lambda x: x[:, :17], plan)  # the key poses of three blocks
-        assert not np.asarray(environment.success(follow(environment, state, plan)[-1])).any()
+        assert not np.asarray(environment.success(environment.follow(state, plan)[-1])).any()
 
 
 def swapped_blocks(environment: Environment, qpos: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from dsvla_jax.model.llama import Llama
 from dsvla_jax.model.lora import merge_lora
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
+from tests.decoding import check_padding_and_batch_mates
 
 VOCAB = 40
 CONFIG = ModelConfig(
@@ -310,22 +311,9 @@ def test_prefill_makes_the_prompts_keys_once_and_extend_keeps_them(variables):
 
 
 def test_padding_and_batch_mates_never_change_an_answer(variables):
-    prompts = make_inputs(LENGTHS)
-    decode = make_decoder(VLA(CONFIG), GRAMMAR)
-    tokens, log_probs = decode(variables, prompts)
-    for b, length in list(enumerate(LENGTHS))[1:]:
-        alone = jax.tree.map(lambda x, b=b: x[b : b + 1], prompts)
-        alone = dataclasses.replace(
-            alone, text_tokens=alone.text_tokens[:, :length], text_mask=alone.text_mask[:, :length]
-        )
-        lonely_tokens, lonely_log_probs = decode(variables, alone)
-        np.testing.assert_array_equal(lonely_tokens[0], tokens[b])
-        np.testing.assert_allclose(lonely_log_probs[0], log_probs[b], atol=1e-4)
-    scribbled = dataclasses.replace(prompts, text_tokens=jnp.where(prompts.text_mask, prompts.text_tokens, 3))
-    np.testing.assert_array_equal(decode(variables, scribbled)[1], log_probs)
-    others = jax.tree.map(lambda x, y: x.at[1:].set(y[1:]), prompts, make_inputs(LENGTHS, seed=5))
-    np.testing.assert_array_equal(decode(variables, others)[0][0], tokens[0])
-    np.testing.assert_array_equal(decode(variables, others)[1][0], log_probs[0])
+    check_padding_and_batch_mates(
+        CONFIG, GRAMMAR, variables, make_inputs(LENGTHS), make_inputs(LENGTHS, seed=5), LENGTHS
+    )
 
 
 @pytest.mark.parametrize(

@@ -52,10 +52,6 @@ class VisionConfig:
     def ffn(self) -> int:
         return round(self.width * self.mlp_ratio)
 
-    @property
-    def output_width(self) -> int:
-        return self.embed_width or self.width
-
 
 @dataclasses.dataclass(frozen=True)
 class RopeScaling:

@@ -130,6 +130,13 @@ class Environment:
             )
         return self._execute(state, action)
 
+    def follow(self, state: SimState, plan: Action) -> list[SimState]:
+        """The states at the start and after each key pose of a plan: pose (B, M, A, 7), gripper_open (B, M, A)."""
+        states = [state]
+        for m in range(plan.pose.shape[1]):
+            states.append(self.execute(states[-1], Action(plan.pose[:, m], plan.gripper_open[:, m])))
+        return states
+
     def observe(self, state: SimState) -> Observation:
         """What a policy sees of the B episodes; every field with the batch in front, the camera's too."""
         rgb, depth, _ = self.render(state)
@@ -163,9 +170,11 @@ class Environment:
         """bool (B,): a target has been held, and none is held now."""
         return self._taken(state)[1]
 
-    def keyframe_limit(self, state: SimState) -> int:
-        """Key poses after which an episode is over: twice as many as the scripted expert takes."""
-        return 2 * jax.eval_shape(self._expert, state).pose.shape[1]
+    @functools.cached_property
+    def expert_keyframes(self) -> int:
+        """M, the key poses of the scripted expert; no action is taken to find out."""
+        state = physics_module.initial_state(self.scene.mj_model, 1, self.camera)
+        return jax.eval_shape(self._expert, state).pose.shape[1]
 
     def keypoints(self, state: SimState) -> Array:
         """float32 (B, A, K, 3), the task's keypoints as the objects are now."""

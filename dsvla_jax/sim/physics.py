@@ -300,10 +300,6 @@ class MjxStepper:
         )
         return self._with_geometry(model, state)
 
-    def update_geometry(self, state: SimState) -> SimState:
-        """Sets geom_xpos and geom_xmat from qpos and the mocap poses."""
-        return jax.vmap(lambda s: self._with_geometry(self._with_state(self.mjx_model, s), s))(state)
-
     def _with_state(self, model: Any, state: SimState) -> Any:
         """The model of one episode: its welds, and its furniture where the mocap poses are. MJX moves a mocap body
         without the bodies that hang from it; those follow the model's own pose of the body."""
