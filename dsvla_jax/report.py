@@ -68,7 +68,9 @@ def write_results(path: str | os.PathLike, results: Iterable[EpisodeResult]) -> 
 
 
 def read_results(path: str | os.PathLike) -> list[EpisodeResult]:
-    """The episodes of a file that `write_results` wrote."""
+    """The episodes of a file that `write_results` wrote. Raises UserError where there is none or it is damaged."""
+    if not Path(path).exists():
+        raise UserError(f"{path}: no results here; evaluate first: python eval.py RUN, under the same conditions")
     results = []
     for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
         try:
