@@ -1,0 +1,205 @@
+"""One RLDS episode: a ``tf.train.Example`` read column by column as the build's own ``features.json`` says.
+
+Only the columns that are asked for are converted. Images stay encoded until a single one is decoded. TensorFlow
+Datasets' feature definitions are used; TensorFlow is not.
+"""
+
+import zlib
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+from google.protobuf.message import DecodeError
+from tensorflow_datasets.core.features import (
+    Dataset,
+    FeatureConnector,
+    FeaturesDict,
+    Image,
+    Tensor,
+)
+from tensorflow_datasets.core.features.tensor_feature import Encoding
+from tensorflow_datasets.proto import tf_example_pb2
+
+from data_pipelines.records import DataError
+
+STEPS = "steps"
+_FIX = "is features.json that of these records? Or leave bad records out with --skip-bad"
+
+
+def parse_features(json_value: Any, where: object) -> dict[str, FeatureConnector]:
+    """The leaves of a parsed ``features.json`` by their path, as ``steps/observation/image``."""
+    try:
+        features = FeatureConnector.from_json(json_value)
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise DataError(
+            where, "features", "the features of a tfds build", str(error), "copy the build again"
+        ) from error
+    return dict(_leaves(features, ""))
+
+
+def _leaves(feature: FeatureConnector, path: str):
+    if isinstance(feature, Dataset):
+        yield from _leaves(feature.feature, path)
+    elif isinstance(feature, FeaturesDict):
+        for name, child in feature.items():
+            yield from _leaves(child, f"{path}/{name}" if path else name)
+    else:
+        yield path, feature
+
+
+class RldsEpisode:
+    """One parsed record. `where` names it in errors, as ``FILE, record 3``. Axis T: steps of the episode."""
+
+    def __init__(self, features: dict[str, FeatureConnector], record: bytes, where: str):
+        self.where = where
+        self._features = features
+        try:
+            example = tf_example_pb2.Example.FromString(record)
+        except DecodeError as error:
+            raise DataError(where, "record", "a tf.train.Example", str(error), _FIX) from error
+        self._values = example.features.feature
+        self.num_steps = self._count_steps()
+
+    def _count_steps(self) -> int:
+        """Counted on the first feature of the steps that the record holds; `column` compares the others with it."""
+        known = False
+        for path, feature in self._features.items():
+            if not path.startswith(f"{STEPS}/") or not isinstance(feature, Tensor | Image) or not _is_simple(feature):
+                continue
+            known = known or path in self._values
+            values = _list_of(self._values[path]) if path in self._values else None
+            if values:
+                return len(values) // max(_values_a_step(feature), 1)
+        if not known:
+            raise DataError(self.where, STEPS, "at least one feature of the steps", "none", _FIX)
+        return 0
+
+    def __contains__(self, path: str) -> bool:
+        return path in self._features
+
+    def column(self, path: str) -> np.ndarray:
+        """A numeric feature: (T, *shape) of its own dtype for a step's, (*shape) for an episode's."""
+        feature = self._feature(path)
+        if not _is_numeric(feature):
+            raise DataError(self.where, path, "a numeric tensor", repr(feature), "ask for another feature")
+        if not _is_simple(feature):
+            raise DataError(
+                self.where, path, "at most one open dimension", repr(feature), "this reader leaves such features unread"
+            )
+        dtype, values = np.dtype(feature.np_dtype), self._raw(path, feature)
+        rows = self.num_steps if path.startswith(f"{STEPS}/") else 1
+        shape = (rows, *(-1 if size is None else size for size in feature.shape))
+        try:
+            if _is_bytes(feature):
+                unzip = zlib.decompress if feature._encoding == Encoding.ZLIB else bytes
+                array = np.frombuffer(b"".join(unzip(value) for value in values), dtype.newbyteorder("<"))
+            else:
+                array = np.fromiter(values, np.int64 if dtype.kind in "iub" else np.float32, count=len(values))
+            array = array.astype(dtype, copy=False)
+            # A dimension of -1 cannot be told from no elements.
+            array = array.reshape(shape) if array.size else np.zeros([max(size, 0) for size in shape], dtype)
+        except (ValueError, zlib.error) as error:
+            raise DataError(self.where, path, f"{dtype} {feature.shape} a step", str(error), _FIX) from error
+        return array if path.startswith(f"{STEPS}/") else array[0]
+
+    def encoded(self, path: str) -> list[bytes]:
+        """The undecoded bytes of an image or string feature, one a step."""
+        feature = self._feature(path)
+        if not (isinstance(feature, Image) or _is_text(feature)):
+            raise DataError(self.where, path, "an image or a string", repr(feature), "ask for another feature")
+        values = list(self._raw(path, feature))
+        if path.startswith(f"{STEPS}/") and len(values) != self.num_steps:
+            raise DataError(self.where, path, f"{self.num_steps} values", str(len(values)), _FIX)
+        return values
+
+    def text(self, path: str) -> list[str]:
+        """A string feature, one a step (or a single one)."""
+        try:
+            return [value.decode() for value in self.encoded(path)]
+        except UnicodeDecodeError as error:
+            raise DataError(self.where, path, "UTF-8", str(error), _FIX) from error
+
+    def image(self, path: str, step: int) -> np.ndarray:
+        """One decoded image: its own dtype, (H, W, C)."""
+        return decode_image(self.encoded(path)[step], self._feature(path), f"{self.where}, step {step}, {path}")
+
+    def _feature(self, path: str) -> Any:
+        if path not in self._features:
+            near = ", ".join(sorted(name for name in self._features if name.split("/")[0] == path.split("/")[0]))
+            raise DataError(self.where, path, "a feature of this build", "none of that name", f"it has: {near}")
+        return self._features[path]
+
+    def _raw(self, path: str, feature: Any) -> Any:
+        """The values of a leaf as protobuf keeps them, of the kind that the feature tells."""
+        if path not in self._values:
+            raise DataError(self.where, path, "to be present", "nothing", _FIX)
+        values = self._values[path]
+        kind = "bytes_list" if _is_bytes(feature) else _kind(feature.np_dtype)
+        found = values.WhichOneof("kind")
+        if found is None:
+            return ()
+        if found != kind:
+            raise DataError(self.where, path, f"{kind} ({feature.np_dtype})", found, _FIX)
+        return getattr(values, kind).value
+
+
+def decode_image(data: bytes, feature: Any, where: object) -> np.ndarray:
+    """The (H, W, C) picture of an Image feature, in its own dtype; RGB order. JPEG or PNG, of 8 or 16 bits.
+
+    A float32 Image is a four-channel PNG whose bytes are the numbers', as tfds writes it.
+    """
+    shape, dtype = feature.shape, np.dtype(feature.np_dtype)
+    colour = shape[-1] == 3 and dtype == np.uint8
+    flag = cv2.IMREAD_COLOR_RGB if colour else cv2.IMREAD_UNCHANGED
+    picture = None
+    if data:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION if colour else flag)
+    if picture is None:
+        raise DataError(where, "image", "a JPEG or PNG", f"{len(data)} undecodable bytes", _FIX)
+    if not colour and picture.ndim == 3:
+        picture = cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA if picture.shape[-1] == 4 else cv2.COLOR_BGR2RGB)
+    if dtype == np.float32:
+        picture = np.ascontiguousarray(picture).view(np.float32)
+    picture = picture.reshape(*picture.shape[:2], -1)
+    expected = tuple(shape)
+    fits = all(size in (None, got) for size, got in zip(expected, picture.shape, strict=True))
+    if picture.dtype != dtype or not fits:
+        raise DataError(where, "image", f"{dtype} {expected}", f"{picture.dtype} {picture.shape}", _FIX)
+    return picture
+
+
+def _is_text(feature: Any) -> bool:
+    return _is_tensor(feature) and np.dtype(feature.np_dtype) == np.object_
+
+
+def _is_numeric(feature: Any) -> bool:
+    return _is_tensor(feature) and not _is_text(feature)
+
+
+def _is_tensor(feature: Any) -> bool:
+    return isinstance(feature, Tensor)
+
+
+def _values_a_step(feature: Any) -> int:
+    return 1 if _is_bytes(feature) else int(np.prod(feature.shape, dtype=int))
+
+
+def _is_bytes(feature: Any) -> bool:
+    """Whether a value is stored as one string of bytes."""
+    return isinstance(feature, Image) or _is_text(feature) or feature._encoding != Encoding.NONE
+
+
+def _is_simple(feature: Any) -> bool:
+    """Whether a value is stored under the feature's own name (several open dimensions take two names)."""
+    return isinstance(feature, Image) or feature.shape.count(None) <= (1 if _is_bytes(feature) else 0)
+
+
+def _list_of(values: Any) -> Any:
+    kind = values.WhichOneof("kind")
+    return None if kind is None else getattr(values, kind).value
+
+
+@cache
+def _kind(dtype: Any) -> str:
+    return "int64_list" if np.dtype(dtype).kind in "iub" else "float_list"

@@ -1,0 +1,71 @@
+"""Files by local path or URL: everything here that opens one does it through these few lines."""
+
+import os
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import fsspec
+
+from data_pipelines.records import DataError
+
+
+def is_remote(path: str) -> bool:
+    """Whether a path is a URL that fsspec opens (gs://, s3://, memory://, ...)."""
+    return "://" in path
+
+
+def as_text(path: str | os.PathLike[str]) -> str:
+    """The path as text; objects of etils' ``epath`` and of pathlib are welcome."""
+    return os.fspath(path)
+
+
+def join(folder: str, *names: str) -> str:
+    """The path of a file in a folder."""
+    return "/".join([folder.rstrip("/"), *names])
+
+
+def open_binary(path: str) -> BinaryIO:
+    """Opens for reading. Raises DataError naming the file where there is none."""
+    try:
+        if not is_remote(path):
+            return Path(path).open("rb")
+        file_system, name = fsspec.core.url_to_fs(path)
+        return file_system.open(name, "rb")
+    except FileNotFoundError as error:
+        raise DataError(path, "file", "to be present", "no such file", "copy the whole build again") from error
+    except ImportError as error:
+        raise DataError(
+            path, "address", "a file system that is installed", str(error), "install the package it names"
+        ) from error
+
+
+def read_text(path: str) -> str:
+    """The whole file as UTF-8."""
+    with open_binary(path) as file:
+        return file.read().decode()
+
+
+def exists(path: str) -> bool:
+    """Whether there is such a file or folder."""
+    if not is_remote(path):
+        return Path(path).exists()
+    file_system, name = fsspec.core.url_to_fs(path)
+    return bool(file_system.exists(name))
+
+
+def size_of(path: str) -> int:
+    """Bytes of a file."""
+    if not is_remote(path):
+        return Path(path).stat().st_size
+    file_system, name = fsspec.core.url_to_fs(path)
+    return int(file_system.size(name))
+
+
+def folders_in(path: str) -> list[str]:
+    """The names of the folders in a folder, sorted; empty where there is no such folder."""
+    if not is_remote(path):
+        here = Path(path)
+        return sorted(child.name for child in here.iterdir() if child.is_dir()) if here.is_dir() else []
+    file_system, name = fsspec.core.url_to_fs(path)
+    entries: list[dict[str, Any]] = file_system.ls(name, detail=True) if file_system.isdir(name) else []
+    return sorted(entry["name"].rstrip("/").rsplit("/", 1)[-1] for entry in entries if entry["type"] == "directory")
