@@ -10,10 +10,12 @@ Weights imported from elsewhere are a folder of their own (`save_weights`).
 
 import dataclasses
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 from flax import traverse_util
 
@@ -35,6 +37,31 @@ class Restored:
     trainable: Any
     optimizer: Any = None
     iterator: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredVariable:
+    """One variable of a run: on disk until it is read."""
+
+    folder: Path
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """How many numbers."""
+        return math.prod(self.shape)
+
+    def read(self) -> np.ndarray:
+        """The variable as it is stored; no other is loaded."""
+        item = traverse_util.unflatten_dict({self.path: jax.ShapeDtypeStruct(self.shape, np.float32)})
+        how = traverse_util.unflatten_dict({self.path: ocp.RestoreArgs(restore_type=np.ndarray)})
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            args = ocp.args.PyTreeRestore(item=item, restore_args=how, partial_restore=True)
+            restored: dict[tuple[str, ...], Any] = traverse_util.flatten_dict(
+                checkpointer.restore(self.folder, args=args)
+            )
+            return restored[self.path]
 
 
 class RunCheckpoints:
@@ -109,6 +136,19 @@ class RunCheckpoints:
         variables = traverse_util.flatten_dict(self.restore(traverse_util.unflatten_dict(trainable)).trainable)
         variables |= traverse_util.flatten_dict(self.restore_base(traverse_util.unflatten_dict(frozen)))
         return traverse_util.unflatten_dict(variables)
+
+    def list_variables(self) -> dict[tuple[str, ...], StoredVariable]:
+        """Every variable of the newest step, trained or frozen, by its path; none is read."""
+        step = self._require_step()
+        items = [(self.folder / str(step) / "trainable", self._manager.item_metadata(step)["trainable"])]
+        if self._base.exists():
+            with ocp.StandardCheckpointer() as checkpointer:
+                items.insert(0, (self._base, checkpointer.metadata(self._base).item_metadata))
+        return {
+            path: StoredVariable(folder, path, tuple(leaf.shape))
+            for folder, metadata in items
+            for path, leaf in traverse_util.flatten_dict(_tree(metadata)).items()
+        }
 
     def _require_step(self) -> int:
         self._manager.wait_until_finished()

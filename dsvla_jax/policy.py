@@ -88,22 +88,27 @@ def save_policy_config(run: Path, config: PolicyConfig, tokenizer: WordTokenizer
     tokenizer.save(run / "tokenizer.json")
 
 
-def load_policy(run: Path) -> Policy:
-    """The policy of a run folder, with the weights of its newest checkpoint.
-
-    Raises CheckpointError naming what is missing or does not fit.
-    """
+def load_policy_config(run: Path) -> PolicyConfig:
+    """What `save_policy_config` wrote. Raises CheckpointError where it did not, or for another version."""
     file = run / "policy.json"
     if not file.exists():
         raise CheckpointError(
             f"{run}: no run here (policy.json is missing); train one: python train.py CONFIG --run {run}"
         )
     try:
-        config = cattrs.Converter(forbid_extra_keys=True).structure(json.loads(file.read_text()), PolicyConfig)
+        return cattrs.Converter(forbid_extra_keys=True).structure(json.loads(file.read_text()), PolicyConfig)
     except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
         raise CheckpointError(
             f"{file}: not a policy of this version of dsvla_jax ({error}); train the run again"
         ) from error
+
+
+def load_policy(run: Path) -> Policy:
+    """The policy of a run folder, with the weights of its newest checkpoint.
+
+    Raises CheckpointError naming what is missing or does not fit.
+    """
+    config = load_policy_config(run)
     tokenizer = WordTokenizer.load(run / "tokenizer.json")
     like = jax.eval_shape(lambda: initialize(config.model, jax.random.key(0)))
     checkpoints = RunCheckpoints(run)

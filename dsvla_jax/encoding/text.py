@@ -82,16 +82,17 @@ class WordTokenizer:
             raise ValueError(f"WordTokenizer: expected distinct single lower-case words, use vocabulary(); got {wrong}")
 
     @functools.cached_property
-    def _pieces(self) -> tuple[str, ...]:
+    def pieces(self) -> tuple[str, ...]:
+        """The text of every token, by its id."""
         return (*_SPECIAL, *map(str, range(LOWEST_NUMBER, HIGHEST_NUMBER + 1)), *self.words)
 
     @functools.cached_property
     def _ids(self) -> dict[str, int]:
-        return {piece: index for index, piece in enumerate(self._pieces)}
+        return {piece: index for index, piece in enumerate(self.pieces)}
 
     @property
     def vocab_size(self) -> int:
-        return len(self._pieces)
+        return len(self.pieces)
 
     @property
     def pad_id(self) -> int:
@@ -123,7 +124,7 @@ class WordTokenizer:
 
     def decode(self, tokens: Sequence[int]) -> str:
         special = (self.pad_id, self.bos_id, self.eos_id)
-        return " ".join(self._pieces[int(token)] for token in tokens if int(token) not in special)
+        return " ".join(self.pieces[int(token)] for token in tokens if int(token) not in special)
 
     def save(self, path: str | pathlib.Path) -> None:
         """Writes the words as JSON."""

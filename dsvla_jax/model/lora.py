@@ -91,11 +91,11 @@ def _add_adapters(params: Mapping, adapters: Mapping, scale: float) -> dict:
     return traverse_util.unflatten_dict(flat)
 
 
-def merge_lora(variables: Mapping, lora: LoraConfig) -> dict:
-    """Add the adapters to the base weights: {"params", "lora"} -> {"params"} of the same outputs without adapters.
+def require_mergeable(variables: Mapping) -> None:
+    """Raises ValueError where no base weights alone give the outputs of ``variables`` with its adapters.
 
-    Raises ValueError where there is no such thing: a visual prompt's keys and values are made with the language
-    model's base weights, so with fusion "adapter" its adapters of k and v cannot be part of those.
+    A visual prompt's keys and values are made with the language model's base weights, so with fusion "adapter" its
+    adapters of k and v cannot be part of those.
     """
     in_language = variables.get("lora", {}).get("language", {}).get("layers", {})
     if "gate" in variables["params"].get("projector", {}) and {"k", "v"} & set(in_language):
@@ -104,6 +104,14 @@ def merge_lora(variables: Mapping, lora: LoraConfig) -> dict:
             "keys and values are made without them; keep the adapters apart, or train with LoraConfig(targets=...) "
             "without k and v"
         )
+
+
+def merge_lora(variables: Mapping, lora: LoraConfig) -> dict:
+    """Add the adapters to the base weights: {"params", "lora"} -> {"params"} of the same outputs without adapters.
+
+    Any part of a model will do. Raises ValueError as `require_mergeable` does.
+    """
+    require_mergeable(variables)
     return {"params": _add_adapters(variables["params"], variables.get("lora", {}), lora.scale)}
 
 

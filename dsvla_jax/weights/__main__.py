@@ -1,6 +1,10 @@
-"""Other projects' weights: python -m dsvla_jax.weights import SRC OUT [--vision SRC2] [--image-size 336]
+"""Other projects' weights in and ours out:
 
-SRC is the folder of a Hugging Face checkpoint with a LLaMA decoder, SRC2 of one with a CLIP vision tower.
+    python -m dsvla_jax.weights import SRC OUT [--vision SRC2] [--image-size 336]
+    python -m dsvla_jax.weights export RUN OUT [--merged] [--dtype bfloat16]
+
+SRC is the folder of a Hugging Face checkpoint with a LLaMA decoder, SRC2 of one with a CLIP vision tower. RUN is a run
+folder of train.py.
 """
 
 import sys
@@ -13,7 +17,10 @@ import numpy as np
 import tyro
 
 from dsvla_jax.command_line import fail_with_message
+from dsvla_jax.encoding.text import WordTokenizer
+from dsvla_jax.policy import load_policy_config
 from dsvla_jax.weights.base import import_backbones
+from dsvla_jax.weights.export import ExportOptions, export_run
 from dsvla_jax.weights.towers import summarize
 
 DTYPES = {"float32": np.float32, "bfloat16": jnp.bfloat16}
@@ -47,13 +54,43 @@ def import_command(
     print(f"written: {out}")
 
 
+def export_command(
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    /,
+    merged: bool = False,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+    shard_gigabytes: float = 2.0,
+    language_base: str | None = None,
+    vision_base: str | None = None,
+) -> None:
+    """Writes the newest checkpoint of a run to a new folder, as PEFT and transformers open it.
+
+    Args:
+        run: a run folder of train.py.
+        out: the folder to write; it appears whole or not at all.
+        merged: write whole models with the adapters added to their weights, instead of the adapters alone.
+        dtype: of the numbers on disk.
+        shard_gigabytes: how large one file of a merged model may be.
+        language_base: the model that the language adapters belong to, a folder or a name on the Hub, noted for peft.
+        vision_base: the same of the vision adapters.
+    """
+    bases = {"language": language_base, "vision": vision_base}
+    options = ExportOptions(merged, DTYPES[dtype], shard_gigabytes * 1e9, bases)
+    config = load_policy_config(run)
+    folders = export_run(run, out, config.model, WordTokenizer.load(run / "tokenizer.json"), options)
+    print(f"written: {out} ({', '.join(folders)})")
+
+
 def main() -> None:
     """Runs the command that the arguments name."""
-    if sys.argv[1:2] != ["import"]:
+    commands = {"import": import_command, "export": export_command}
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name not in commands:
         print(__doc__)
-        sys.exit(0 if sys.argv[1:2] in ([], ["-h"], ["--help"]) else 2)
+        sys.exit(0 if name in ("", "-h", "--help") else 2)
     with fail_with_message():
-        tyro.cli(import_command, args=sys.argv[2:], prog="python -m dsvla_jax.weights import")
+        tyro.cli(commands[name], args=sys.argv[2:], prog=f"python -m dsvla_jax.weights {name}")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,53 @@
+"""Writes run folders with random weights, as train.py leaves them, without training."""
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
+from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.variables import split_variables
+from dsvla_jax.model.vla import initialize
+from dsvla_jax.policy import PolicyConfig, save_policy_config
+
+TOKENIZER = WordTokenizer(vocabulary(["close the box", "stack 2 red blocks"]))
+
+
+def write_run(run: Path, model: ModelConfig, regime: str = "lora") -> dict[str, Any]:
+    """Writes a run of ``model`` and returns its variables: no zeros, no ones, adapters that do something.
+
+    Values are drawn from the variables' names, so runs with and without adapters have the same base.
+    """
+    variables = jax.eval_shape(lambda: initialize(model, jax.random.key(0)))
+
+    def fill(path: Any, leaf: Any) -> np.ndarray:
+        name = path[-1].key
+        random = np.random.default_rng(zlib.crc32(jax.tree_util.keystr(path).encode()))
+        noise = random.standard_normal(leaf.shape)
+        if leaf.ndim > 1 and name not in ("bias", "scale", "gate"):
+            noise = noise / leaf.shape[-2] ** 0.5
+        else:
+            noise = 0.2 * noise
+        return np.asarray(noise + (name == "scale"), np.float32)
+
+    variables = jax.tree_util.tree_map_with_path(fill, variables)
+    trainable, frozen = split_variables(variables, regime)
+    run.mkdir(parents=True)
+    encoding = EncodingConfig(
+        image_size=model.vision.image_size,
+        patch_size=model.vision.patch_size,
+        points=PointTokenizerConfig(num_points=64, group_sizes=(16, 8), neighbours=4, width=model.vision.width),
+        max_text_length=64,
+    )
+    save_policy_config(run, PolicyConfig(encoding, model), TOKENIZER)
+    checkpoints = RunCheckpoints(run)
+    checkpoints.save_base(frozen)
+    checkpoints.save(1, trainable, {"count": np.zeros(1)}, {"position": 0})
+    checkpoints.close()
+    return variables
