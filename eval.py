@@ -18,10 +18,11 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+import dsvla_jax.policy
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.compile_times import first_use
 from dsvla_jax.errors import UserError
-from dsvla_jax.policy import Policy, load_policy
+from dsvla_jax.policy import Policy
 from dsvla_jax.report import (
     EpisodeResult,
     film_strip,
@@ -81,7 +82,7 @@ def main(options: Options) -> None:
     missing = [name for name in tasks if name not in {result.task for result in kept}]
     results = kept
     if missing:
-        policy = load_policy(options.run)
+        policy = dsvla_jax.policy.load(options.run)
         for name in missing:
             endings = evaluate_task(policy, experiment, name, episodes, options)
             save_strips(file, name, endings)

@@ -19,6 +19,7 @@ import tyro
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
+import dsvla_jax.policy
 from configs import config_names, get_config
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
@@ -30,7 +31,7 @@ from dsvla_jax.encoding.text import WordTokenizer, load_tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.policy import PolicyConfig, load_policy, save_policy_config
+from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.sharding import batch_sharding, replicate
@@ -118,7 +119,7 @@ def initial_variables(experiment: Experiment, number_values: np.ndarray) -> dict
     """The variables at step 0: random by the seed, or those of the base run with fresh adapters."""
     variables = jax.jit(lambda: initialize(experiment.model, jax.random.key(experiment.seed), number_values))()
     if experiment.base:
-        base = load_policy(Path(experiment.base)).variables
+        base = dsvla_jax.policy.load(Path(experiment.base)).variables
         require_same_shapes(base["params"], variables["params"], Path(experiment.base))
         variables = {**variables, "params": base["params"]}
     return variables

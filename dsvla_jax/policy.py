@@ -48,7 +48,7 @@ def _decode(
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A policy ready to act. Build one with `load_policy`."""
+    """A policy ready to act. Build one with `load`."""
 
     config: PolicyConfig
     variables: Variables
@@ -59,6 +59,18 @@ class Policy:
         """From poses to bins and back."""
         return self.config.encoding.codec
 
+    def encode_prompt(
+        self, instruction: str, pose: np.ndarray, gripper_open: np.ndarray, keypoints: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The question of one robot as tokens int32 (T,) and their mask bool (T,), see `encode_text`.
+
+        pose: (A, 7). gripper_open: (A,). keypoints: (A, 3), the active ones, or None.
+        Raises ValueError where the instruction is too long or has a number that no token stands for.
+        """
+        encoding = self.config.encoding
+        prompt = build_prompt(encoding, instruction, pose, gripper_open, keypoints)
+        return encode_text(self.tokenizer, prompt, None, encoding.max_text_length)[:2]
+
     def act(
         self, observation: Observation, instructions: Sequence[str], keypoints: np.ndarray | None
     ) -> tuple[Action, list[str]]:
@@ -67,23 +79,20 @@ class Policy:
         observation: with a leading axis B; pose (B, A, 7). keypoints: float32 (B, A, 3), the active one of each arm,
         in metres and the world frame, or None. An answer is well-formed whatever the weights are.
         """
-        encoding = self.config.encoding
         poses, grippers = np.asarray(observation.pose), np.asarray(observation.gripper_open)
-        arms = poses.shape[1]
-        prompts = [
-            build_prompt(encoding, text, poses[i], grippers[i], None if keypoints is None else keypoints[i])
+        encoded = [
+            self.encode_prompt(text, poses[i], grippers[i], None if keypoints is None else keypoints[i])
             for i, text in enumerate(instructions)
         ]
-        encoded = [encode_text(self.tokenizer, prompt, None, encoding.max_text_length)[:2] for prompt in prompts]
         tokens, masks = (np.stack(column) for column in zip(*encoded, strict=True))
         answers = _decode(self.config, self.tokenizer, self.variables, observation, tokens, masks)
         texts = [self.tokenizer.decode([int(token) for token in row]) for row in np.asarray(answers)]
-        bins = np.stack([parse_answer(text, arms, encoding.style) for text in texts])
+        bins = np.stack([parse_answer(text, poses.shape[1], self.config.encoding.style) for text in texts])
         return jax.vmap(self.codec.decode)(jnp.asarray(bins)), texts
 
 
 def save_policy_config(run: Path, config: PolicyConfig, tokenizer: WordTokenizer) -> None:
-    """Writes what `load_policy` needs besides a checkpoint."""
+    """Writes what `load` needs besides a checkpoint."""
     (run / "policy.json").write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
     tokenizer.save(run / "tokenizer.json")
 
@@ -103,7 +112,7 @@ def load_policy_config(run: Path) -> PolicyConfig:
         ) from error
 
 
-def load_policy(run: Path) -> Policy:
+def load(run: Path) -> Policy:
     """The policy of a run folder, with the weights of its newest checkpoint.
 
     Raises CheckpointError naming what is missing or does not fit.

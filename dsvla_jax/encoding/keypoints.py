@@ -4,8 +4,11 @@ An arm has K keypoints in the order the instruction names them. The active one i
 5 cm of; it never goes back, and the last one stays active for good. Arms with fewer than K keypoints repeat their last.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from dsvla_jax.types import Array
@@ -22,11 +25,12 @@ def active_keypoint(latched_count: ArrayLike, keypoints: ArrayLike, count: Array
         count: int (), how many of the K are real; all when None.
 
     Returns:
-        float (3,).
+        float (3,). A NumPy array if ``keypoints`` is one.
     """
-    keypoints = jnp.asarray(keypoints)
-    last = (keypoints.shape[0] if count is None else jnp.asarray(count)) - 1
-    return keypoints[jnp.clip(jnp.asarray(latched_count), 0, last)]
+    xp: Any = np if isinstance(keypoints, np.ndarray) else jnp
+    points: Any = xp.asarray(keypoints)
+    last = (points.shape[0] if count is None else xp.asarray(count)) - 1
+    return points[xp.clip(xp.asarray(latched_count), 0, last)]
 
 
 def advance_latch(
@@ -42,12 +46,13 @@ def advance_latch(
         end_effector: float (A, 3). keypoints: float (A, K, 3). Metres, world frame.
 
     Returns:
-        int32 (A,), at least ``latched``.
+        int32 (A,), at least ``latched``. A NumPy array if ``keypoints`` is one.
     """
-    keypoints = jnp.asarray(keypoints)
-    distance = jnp.linalg.norm(keypoints - jnp.asarray(end_effector)[:, None, :], axis=-1)
-    reached = (distance < radius) | (jnp.arange(keypoints.shape[1]) < jnp.asarray(latched)[:, None])
-    return jnp.sum(jnp.cumprod(reached.astype(jnp.int32), axis=1), axis=1, dtype=jnp.int32)
+    xp: Any = np if isinstance(keypoints, np.ndarray) else jnp
+    points: Any = xp.asarray(keypoints)
+    distance = xp.linalg.norm(points - xp.asarray(end_effector)[:, None, :], axis=-1)
+    reached = (distance < radius) | (xp.arange(points.shape[1]) < xp.asarray(latched)[:, None])
+    return xp.sum(xp.cumprod(reached.astype(np.int32), axis=1), axis=1, dtype=np.int32)
 
 
 def perturb_keypoints(key: Array, keypoints: ArrayLike, max_offset: float = 0.03, probability: float = 0.5) -> Array:

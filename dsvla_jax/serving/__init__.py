@@ -1,0 +1,1 @@
+"""A policy behind a websocket, for robots. `messages` and `client` need NumPy, msgpack and websockets only."""

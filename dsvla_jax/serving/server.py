@@ -1,0 +1,272 @@
+"""The policy server: openpi's websocket protocol, and over HTTP /healthz and /metrics.
+
+On connecting a robot is sent the metadata, a map; then each of its requests gets one reply. A reply is a binary frame;
+an error is a text frame that says what was wrong, and the connection stays open, unlike openpi's.
+"""
+
+import asyncio
+import contextlib
+import dataclasses
+import hmac
+import http
+import logging
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+from websockets.http11 import Request as HttpRequest
+from websockets.http11 import Response
+
+from dsvla_jax.errors import UserError
+from dsvla_jax.policy import Policy
+from dsvla_jax.serving.batching import Answer, MicroBatcher, Question, Timing, answer_batch, batch_sizes, blank_question
+from dsvla_jax.serving.messages import pack, unpack
+from dsvla_jax.serving.metrics import Metrics
+from dsvla_jax.serving.requests import FIELDS, OPTIONAL_FIELDS, BadRequest, Expected, Request, parse_request
+from dsvla_jax.serving.session import Session
+
+log = logging.getLogger(__name__)
+
+MAX_FRAGMENTS = 4096  # of one message; each costs more memory than the bytes it brings
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What one robot may ask of a server that others depend on."""
+
+    clients: int = 64
+    """Connections at a time."""
+    batch: int = 16
+    """Robots answered together at most."""
+    request_seconds: float = 30.0
+    """From a request to its answer."""
+    message_seconds: float = 10.0
+    """For a message to arrive once it has begun; a silent peer is asked for a sign of life as often."""
+    idle_seconds: float = 3600.0
+    """Between two requests of a robot."""
+
+
+class PolicyServer:
+    """Serves one policy. ``async with PolicyServer(...).listen(host, port) as socket_server: ...``
+
+    token: what robots must show as ``Authorization: Bearer`` (or openpi's ``Api-Key``); None lets anyone in.
+    name: of the policy, told to robots.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        image_sizes: Sequence[tuple[int, int]],
+        arms: Sequence[int],
+        limits: Limits | None = None,
+        token: str | None = None,
+        name: str = "policy",
+    ):
+        self.limits = limits or Limits()
+        self.expected = Expected(tuple(image_sizes), tuple(arms), policy.codec)
+        self.metrics = Metrics()
+        self._policy, self._token, self._name = policy, token, name
+        self._sizes = batch_sizes(self.limits.batch)
+        self._batcher = MicroBatcher(lambda questions, size: answer_batch(policy, questions, size), self._sizes)
+        self._ready = asyncio.Event()
+        self._clients = 0
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What a robot is told on connecting."""
+        return {
+            "name": self._name,
+            "request": FIELDS,
+            "optional": OPTIONAL_FIELDS,
+            "reply": {
+                "actions": "float32 (1, A * 8): the next key pose, x y z qx qy qz qw gripper_open of each arm",
+                "text": "the policy's answer",
+                "keypoint": "the active keypoint of each arm, metres, world frame, or None",
+                "reached": "how many keypoints each arm has reached",
+            },
+            "needs_keypoints": self._policy.config.encoding.use_keypoints,
+            "image_sizes": [list(size) for size in self.expected.image_sizes],
+            "arms": list(self.expected.arms),
+            "workspace_low": list(self.expected.codec.low),
+            "workspace_high": list(self.expected.codec.high),
+            "max_message_bytes": self.expected.max_message_bytes,
+        }
+
+    @contextlib.asynccontextmanager
+    async def listen(self, host: str = "127.0.0.1", port: int = 8000):
+        """Listens, compiles everything, then lets requests in. Yields the websockets server, ready."""
+        seconds = self.limits.message_seconds
+        async with contextlib.AsyncExitStack() as stack:
+            server: Server = await stack.enter_async_context(
+                serve(
+                    self._handle,
+                    host,
+                    port,
+                    process_request=self._http,
+                    origins=[None],  # no web page: a browser would let any site on the internet reach a robot
+                    compression=None,
+                    max_size=self.expected.max_message_bytes,
+                    max_queue=1,
+                    open_timeout=seconds,
+                    ping_interval=seconds,
+                    ping_timeout=seconds,
+                    close_timeout=seconds,
+                )
+            )
+            answering = asyncio.create_task(self._batcher.run())
+            stack.callback(answering.cancel)
+            await self._warm_up()
+            self._ready.set()
+            self.metrics.ready.set(1)
+            yield server
+
+    async def _warm_up(self) -> None:
+        # From the largest on: what does not fit into memory shows first.
+        for arms in self.expected.arms:
+            for height, width in self.expected.image_sizes:
+                for size in reversed(self._sizes):
+                    started = time.monotonic()
+                    question = blank_question(arms, height, width)
+                    await asyncio.to_thread(answer_batch, self._policy, [question], size)
+                    log.info(
+                        "%d arm(s), %d x %d pixels, batch of %d: compiled in %.1f s",
+                        *(arms, height, width, size, time.monotonic() - started),
+                    )
+
+    def _http(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
+        """Answers what is not a websocket; None lets a websocket in."""
+        path = request.path.partition("?")[0]
+        if path == "/healthz":
+            if self._ready.is_set():
+                return connection.respond(http.HTTPStatus.OK, "OK\n")
+            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "compiling\n")
+        if not self._may_enter(request.headers.get_all("Authorization")):
+            return connection.respond(http.HTTPStatus.UNAUTHORIZED, "expected the header Authorization: Bearer TOKEN\n")
+        if path == "/metrics":
+            response = connection.respond(http.HTTPStatus.OK, self.metrics.text())
+            del response.headers["Content-Type"]
+            response.headers["Content-Type"] = "text/plain; version=0.0.4; charset=utf-8"
+            return response
+        if self._clients >= self.limits.clients:
+            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{self._clients} robots are connected\n")
+        return None
+
+    def _may_enter(self, credentials: Sequence[str]) -> bool:
+        if self._token is None:
+            return True
+        scheme, _, token = (credentials[0] if len(credentials) == 1 else "").partition(" ")
+        known = scheme.lower() in ("bearer", "api-key")
+        return known and hmac.compare_digest(token.strip().encode(), self._token.encode())
+
+    async def _handle(self, connection: ServerConnection) -> None:
+        """One robot, from its connection to its end."""
+        if self._clients >= self.limits.clients:
+            await connection.close(CloseCode.TRY_AGAIN_LATER, f"{self._clients} robots are connected")
+            return
+        self._clients += 1
+        self.metrics.connections.set(self._clients)
+        try:
+            await self._ready.wait()
+            await connection.send(pack(self.metadata))
+            await self._converse(connection)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._clients -= 1
+            self.metrics.connections.set(self._clients)
+
+    async def _converse(self, connection: ServerConnection) -> None:
+        session, previous = Session(), None
+        while True:
+            try:
+                message = await self._receive(connection)
+            except (TimeoutError, _TooManyFragments) as error:
+                await connection.close(CloseCode.POLICY_VIOLATION, str(error))
+                return
+            started = time.monotonic()
+            outcome, reply = await self._reply(message, session, previous)
+            self.metrics.requests.labels(outcome).inc()
+            async with asyncio.timeout(self.limits.message_seconds):
+                await connection.send(reply)
+            previous = time.monotonic() - started
+            self.metrics.latency.observe(previous)
+
+    async def _receive(self, connection: ServerConnection) -> str | bytes:
+        """The next message, which may take long to begin, but not to arrive."""
+        fragments: list[Any] = []
+        try:
+            async with asyncio.timeout(self.limits.idle_seconds) as limit:
+                async for fragment in connection.recv_streaming():
+                    if not fragments:
+                        limit.reschedule(asyncio.get_running_loop().time() + self.limits.message_seconds)
+                    fragments.append(fragment)
+                    if len(fragments) > MAX_FRAGMENTS:
+                        raise _TooManyFragments(f"a message of more than {MAX_FRAGMENTS} fragments")
+        except TimeoutError as error:
+            what = "a message took too long to arrive" if fragments else "no request for too long"
+            raise TimeoutError(what) from error
+        return ("" if isinstance(fragments[0], str) else b"").join(fragments)
+
+    async def _reply(self, message: str | bytes, session: Session, previous: float | None) -> tuple[str, str | bytes]:
+        """(outcome for the metrics, frame to send)."""
+        try:
+            if isinstance(message, str):
+                raise BadRequest("expected a binary frame of msgpack, got a text frame")
+            request = parse_request(unpack(message), self.expected)
+            question, reached = self._question(request, session)
+            async with asyncio.timeout(self.limits.request_seconds):
+                answer, timing = await self._batcher.ask(question)
+        except UserError as error:
+            return "bad", str(error)
+        except TimeoutError:
+            return "timed_out", f"no answer within {self.limits.request_seconds:g} s: the server is overloaded"
+        except Exception:
+            # The policy failed on this batch. Its robots are told, the log has the traceback, the others go on.
+            log.exception("the policy failed")
+            return "failed", "internal error: the policy failed on this request; the server's log says why"
+        self.metrics.answering.observe(timing.answering)
+        self.metrics.batch.observe(timing.batch)
+        return "answered", pack(_reply_map(question, answer, timing, reached, previous))
+
+    def _question(self, request: Request, session: Session) -> tuple[Question, np.ndarray | None]:
+        """The request as the policy is asked it. What the policy would refuse is refused here, for one robot alone."""
+        keypoints = reached = None
+        if self._policy.config.encoding.use_keypoints:
+            if request.keypoints is None:
+                raise BadRequest("keypoints: this policy was trained with them; send " + OPTIONAL_FIELDS["keypoints"])
+            keypoints, reached = session.advance(request, request.keypoints)
+        observation = request.observation
+        pose, gripper_open = np.asarray(observation.pose), np.asarray(observation.gripper_open)
+        try:
+            self._policy.encode_prompt(request.instruction, pose, gripper_open, keypoints)
+        except ValueError as error:
+            raise BadRequest(f"prompt: {error}") from error
+        return Question(request.instruction, observation, keypoints), reached
+
+
+class _TooManyFragments(Exception):
+    pass
+
+
+def _reply_map(
+    question: Question, answer: Answer, timing: Timing, reached: np.ndarray | None, previous: float | None
+) -> dict[str, Any]:
+    # Arrays have the length of an action chunk in front, because openpi's ActionChunkBroker indexes every array by it.
+    server_timing = {
+        "infer_ms": timing.answering * 1000,
+        "queue_ms": timing.waited * 1000,
+        "batch": timing.batch,
+    }
+    if previous is not None:
+        server_timing["prev_total_ms"] = previous * 1000
+    return {
+        "actions": np.concatenate([answer.pose, answer.gripper_open[:, None]], axis=-1).reshape(1, -1),
+        "text": answer.text,
+        "keypoint": None if question.keypoints is None else question.keypoints.tolist(),
+        "reached": None if reached is None else reached.tolist(),
+        "server_timing": server_timing,
+    }

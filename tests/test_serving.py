@@ -1,0 +1,333 @@
+"""The policy server: the wire format, answers that are never crossed, and requests that mean no good."""
+
+import concurrent.futures
+import contextlib
+import http.client
+import socket
+import struct
+import time
+
+import msgpack
+import numpy as np
+import pytest
+import websockets.sync.client
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.serving.batching import answer_batch, batch_sizes
+from dsvla_jax.serving.client import PolicyClient, ServerError
+from dsvla_jax.serving.messages import MAX_CONTAINERS, MessageError, pack, unpack
+from dsvla_jax.serving.requests import BadRequest, parse_request
+from dsvla_jax.serving.session import Session
+from tests.golden import serving as golden
+from tests.serving import SIZE, observation, running, small_server, tiny_policy
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return tiny_policy()
+
+
+@pytest.fixture(scope="module")
+def running_server(policy):
+    with running(lambda: small_server(policy)) as server_and_port:
+        yield server_and_port
+
+
+@pytest.fixture
+def client(running_server):
+    with PolicyClient(port=running_server[1]) as connected:
+        yield connected
+
+
+def get(port: int, path: str, **headers: str) -> tuple[int, str]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    response = connection.getresponse()
+    return response.status, response.read().decode()
+
+
+def ask(port: int, seed: int) -> dict:
+    with PolicyClient(port=port) as client:
+        return client.infer(observation(seed))
+
+
+def expected_text(server, policy, seed: int) -> str:
+    """What the policy answers by itself, without a server, to the first request of an episode."""
+    request = parse_request(observation(seed), server.expected)
+    question, _ = server._question(request, Session())
+    return answer_batch(policy, [question], 1)[0].text
+
+
+def assert_same(got, expected) -> None:
+    if isinstance(expected, dict):
+        assert got.keys() == expected.keys()
+        for key, value in expected.items():
+            assert_same(got[key], value)
+    elif isinstance(expected, np.ndarray | np.generic):
+        assert got.dtype == expected.dtype
+        np.testing.assert_array_equal(got, expected)
+    else:
+        assert got == expected
+
+
+def test_messages_are_those_of_openpi_client():
+    written = (golden.HERE / "openpi_message.msgpack").read_bytes()
+    assert_same(unpack(written), golden.message())
+    assert pack(golden.message()) == written
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xc1",
+        b"not msgpack at all",
+        pack({"rgb": np.zeros(4)})[:-3],
+        pack(1) + b"more",
+        msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "O", b"shape": [0]}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"1234", b"dtype": "<f4", b"shape": [2]}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "<f4", b"shape": [2**40, 2**40, 0]}),
+        msgpack.packb({b"__ndarray__": True, b"data": b"", b"dtype": "<f4", b"shape": [-1]}),
+        msgpack.packb({b"__ndarray__": True}),
+        msgpack.packb({b"__npgeneric__": True, b"dtype": "<f4", b"data": "x"}),
+        msgpack.packb({b"__npgeneric__": True, b"dtype": "u1", b"data": 300}),
+        msgpack.packb([[]] * (MAX_CONTAINERS + 1)),
+        b"\x91" * 4000 + b"\xc0",
+        msgpack.packb(msgpack.ExtType(1, b"code")),
+        b"\xdd\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+    ],
+)
+def test_what_is_no_message_is_refused(data):
+    try:
+        value = unpack(data)
+    except MessageError:
+        return
+    # An empty array is well-formed, however large its other sizes.
+    assert isinstance(value, np.ndarray)
+    assert value.size == 0
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "complaint"),
+    [
+        ("prompt", "", "prompt: expected 1 to"),
+        ("prompt", "x" * 2000, "prompt: expected 1 to"),
+        ("prompt", 3, "prompt: expected 1 to"),
+        ("rgb", np.zeros((SIZE, SIZE, 3), np.float32), r"rgb: expected a uint8 array \(32, 32, 3\), got float32"),
+        ("rgb", np.zeros((64, 64, 3), np.uint8), "--image-size"),
+        ("rgb", None, "rgb: expected a uint8 array"),
+        ("depth", np.ones((SIZE, SIZE), np.uint16), "divide millimetres by 1000"),
+        ("depth", np.ones((SIZE, SIZE + 1)), r"depth: .* got shape \(32, 33\)"),
+        ("intrinsics", np.zeros((3, 3)), "intrinsics: expected"),
+        ("intrinsics", np.eye(4), r"got shape \(4, 4\)"),
+        ("world_from_camera", 2 * np.eye(4), "world_from_camera: expected a rotation"),
+        ("world_from_camera", np.diag([1.0, 1.0, -1.0, 1.0]), "world_from_camera: expected a rotation"),
+        ("pose", np.zeros((2, 7)), "expected 1 arm"),
+        ("pose", [[0.2, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0]], "quaternions x y z w of length 1"),
+        ("pose", [[200.0, 0.0, 1000.0, 0.0, 0.0, 0.0, 1.0]], "outside the workspace"),
+        ("pose", [[np.nan] * 7], "pose: expected finite"),
+        ("pose", [[0.2], [0.1, 0.3]], "pose: expected float"),
+        ("pose", [["a"] * 7], "pose: expected float"),
+        ("gripper_open", np.ones(2), r"gripper_open: .* got shape \(2,\)"),
+        ("keypoints", np.ones((1, 0, 3)), "K = 0"),
+        ("keypoints", np.ones((1, 17, 3)), "K = 17"),
+        ("keypoints", np.ones((2, 1, 3)), "keypoints: expected"),
+        ("keypoints", [[[0.0, 0.0, 50.0]]], "outside the workspace"),
+        ("keypoint", np.ones((1, 3)), r"unknown \[\"'keypoint'\"\]"),
+        ("reset", 1.5, "reset: expected"),
+    ],
+)
+def test_a_bad_field_is_named_with_what_was_expected(running_server, field, value, complaint):
+    with pytest.raises(BadRequest, match=complaint):
+        parse_request({**observation(0), field: value}, running_server[0].expected)
+
+
+def test_a_missing_field_is_named(running_server):
+    request = observation(0)
+    del request["depth"]
+    with pytest.raises(BadRequest, match=r"missing \['depth'\].*depth: float \(H, W\)"):
+        parse_request(request, running_server[0].expected)
+
+
+def test_poses_may_be_lists_and_any_float(running_server):
+    request = observation(3)
+    other = {**request, "pose": request["pose"].tolist(), "depth": request["depth"].astype(np.float64)}
+    first, second = (parse_request(one, running_server[0].expected) for one in (request, other))
+    assert_same(np.asarray(second.observation.pose), np.asarray(first.observation.pose))
+    assert_same(np.asarray(second.observation.depth), np.asarray(first.observation.depth))
+
+
+def test_a_robot_is_told_what_to_send_and_gets_the_policys_action(running_server, client, policy):
+    server, _ = running_server
+    assert client.metadata["image_sizes"] == [[SIZE, SIZE]]
+    assert client.metadata["needs_keypoints"] is True
+    reply = client.infer(observation(5))
+    assert reply["text"] == expected_text(server, policy, 5)
+    assert reply["actions"].shape == (1, 8)
+    said = policy.codec.decode(parse_answer(reply["text"], 1, "compact"))
+    np.testing.assert_allclose(reply["actions"][0], [*said.pose[0], *said.gripper_open], atol=1e-6)
+    assert reply["server_timing"]["infer_ms"] > 0
+    assert "prev_total_ms" in client.infer(observation(6))["server_timing"]
+
+
+def test_answers_are_never_crossed(running_server, policy):
+    """Robots that ask at the same time, in batches of different sizes, each get the answer to their own question."""
+    server, port = running_server
+    texts = [expected_text(server, policy, seed) for seed in range(12)]
+    assert len(set(texts)) > 6
+
+    def ask_often(seed: int) -> list[tuple[str, int]]:
+        with PolicyClient(port=port) as client:
+            replies = [client.infer({**observation(seed), "reset": True}) for _ in range(8)]
+        return [(reply["text"], reply["server_timing"]["batch"]) for reply in replies]
+
+    with concurrent.futures.ThreadPoolExecutor(12) as robots:
+        answers = list(robots.map(ask_often, range(12)))
+    for seed, replies in enumerate(answers):
+        assert {text for text, _ in replies} == {texts[seed]}
+    assert max(batch for replies in answers for _, batch in replies) > 1
+
+
+def test_sizes_of_batches_are_powers_of_two_up_to_the_largest():
+    assert batch_sizes(1) == (1,)
+    assert batch_sizes(12) == (1, 2, 4, 8, 12)
+    assert batch_sizes(16) == (1, 2, 4, 8, 16)
+
+
+def test_an_arm_that_has_come_near_its_keypoint_is_sent_to_the_next(client):
+    request = observation(1)
+    first, second = request["keypoints"][0]
+    away = client.infer(request)
+    assert (away["reached"], away["keypoint"]) == ([0], [first.tolist()])
+    near = {**request, "pose": np.concatenate([first + 0.02, request["pose"][0, 3:]])[None]}
+    assert client.infer(near)["keypoint"] == [second.tolist()]
+    assert client.infer(request)["reached"] == [1]  # it never goes back
+    assert client.infer({**request, "reset": True})["reached"] == [0]
+    client.infer(near)
+    assert client.infer({**request, "prompt": "lift the ball"})["reached"] == [0]
+
+
+def test_a_bad_request_gets_an_error_and_the_connection_goes_on(client):
+    for bad, complaint in (
+        ({}, "missing"),
+        ({**observation(0), "rgb": 3}, "rgb: expected"),
+        ({**observation(0), "keypoints": None}, "trained with them"),
+        ({**observation(0), "prompt": "stack 999 blocks"}, "number 999 has no token"),
+        ({**observation(0), "prompt": "the " * 100}, "max_text_length"),
+    ):
+        with pytest.raises(ServerError, match=complaint):
+            client.infer(bad)
+    assert client.infer(observation(0))["text"]
+
+
+def test_a_policy_without_keypoints_needs_none():
+    with running(lambda: small_server(tiny_policy(use_keypoints=False), limits={"batch": 1})) as (_, port):
+        request = observation(0)
+        del request["keypoints"]
+        with PolicyClient(port=port) as client:
+            assert client.infer(request)["keypoint"] is None
+
+
+def test_health_and_metrics(running_server):
+    _, port = running_server
+    ask(port, 0)
+    assert get(port, "/healthz") == (200, "OK\n")
+    status, page = get(port, "/metrics")
+    assert status == 200
+    assert 'dsvla_requests_total{outcome="answered"}' in page
+    assert "dsvla_ready 1.0" in page
+    assert "dsvla_batch_robots_bucket" in page
+
+
+def test_a_token_keeps_others_out(policy):
+    with running(lambda: small_server(policy, token="secret", limits={"batch": 1})) as (_, port):
+        for wrong in (None, "other"):
+            with pytest.raises(InvalidStatus, match="401"):
+                PolicyClient(port=port, token=wrong)
+        assert get(port, "/metrics")[0] == 401
+        assert get(port, "/metrics", Authorization="Bearer secret")[0] == 200
+        assert get(port, "/healthz")[0] == 200
+        openpis = {"Authorization": "Api-Key secret"}
+        with websockets.sync.client.connect(f"ws://127.0.0.1:{port}", additional_headers=openpis) as connection:
+            assert unpack(connection.recv(decode=False))["name"] == "policy"
+        with PolicyClient(port=port, token="secret") as client:
+            assert client.infer(observation(0))["text"]
+
+
+def test_web_pages_are_kept_out(running_server):
+    page = {"Origin": "http://example.com"}
+    with (
+        pytest.raises(InvalidStatus, match="403"),
+        websockets.sync.client.connect(f"ws://127.0.0.1:{running_server[1]}", additional_headers=page),
+    ):
+        pass
+
+
+def test_more_robots_than_the_limit_are_turned_away(policy):
+    with running(lambda: small_server(policy, limits={"batch": 1, "clients": 1})) as (_, port):
+        with PolicyClient(port=port), pytest.raises(InvalidStatus, match="503"):
+            PolicyClient(port=port)
+        ask(port, 0)
+
+
+def send_raw(port: int, data: bytes) -> socket.socket:
+    connection = socket.create_connection(("127.0.0.1", port), timeout=20)
+    connection.sendall(data)
+    return connection
+
+
+HANDSHAKE = (
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
+def closed_within(connection: socket.socket, seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    connection.settimeout(seconds)
+    try:
+        while time.monotonic() < deadline:
+            if not connection.recv(65536):
+                return True
+    except ConnectionResetError:
+        return True
+    except TimeoutError:
+        return False
+    return False
+
+
+def test_slow_and_half_open_connections_are_dropped_while_others_are_served(running_server, policy):
+    server, port = running_server
+    frame = bytes([0x82, 0xFE]) + struct.pack("!H", 5000) + b"\0\0\0\0" + b"x" * 10  # of 5,000 bytes, ten
+    fragment = bytes([0x02, 0x81]) + b"\0\0\0\0x"  # more are announced, and never come
+    slow = [send_raw(port, data) for data in (b"GET / HT", b"", HANDSHAKE + frame, HANDSHAKE + fragment)]
+    assert ask(port, 7)["text"] == expected_text(server, policy, 7)
+    assert all(closed_within(connection, 20) for connection in slow)
+    assert ask(port, 7)["text"] == expected_text(server, policy, 7)
+
+
+def test_messages_that_are_too_large_close_their_own_connection(running_server):
+    server, port = running_server
+    with PolicyClient(port=port) as other:
+        for message in (b"x" * (server.expected.max_message_bytes + 1), [b"x"] * 5000):
+            with websockets.sync.client.connect(f"ws://127.0.0.1:{port}", max_size=None) as connection:
+                connection.recv()
+                with contextlib.suppress(ConnectionClosed):
+                    connection.send(message)
+                with pytest.raises(ConnectionClosed):
+                    connection.recv()
+        assert other.infer(observation(2))["text"]
+
+
+def test_text_frames_and_garbage_get_an_error(running_server):
+    with websockets.sync.client.connect(f"ws://127.0.0.1:{running_server[1]}") as connection:
+        connection.recv()
+        for message, complaint in (("hello", "binary frame"), (b"\xc1", "expected msgpack"), (b"", "expected msgpack")):
+            connection.send(message)
+            reply = connection.recv()
+            assert isinstance(reply, str)
+            assert complaint in reply
+        connection.send(pack(observation(0)))
+        assert isinstance(connection.recv(), bytes)
