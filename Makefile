@@ -33,6 +33,11 @@ test: setup  ## the test suite
 test-slow: setup  ## the long tests too
 	$(PY) -m pytest -m "slow or not slow"
 
+parity: setup  ## live comparison with transformers, peft and TensorFlow, which are installed beside the locked packages
+	$(VENV)/bin/uv pip install --quiet --python $(PY) "torch>=2.9" "transformers>=5" "peft>=0.18" "tensorflow-cpu>=2.21"
+	$(PY) -m pytest -m parity
+	$(PY) -m benchmarks.rlds_parity
+
 bench: setup  ## list the checks that take minutes
 	$(PY) -m benchmarks
 
