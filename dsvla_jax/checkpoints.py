@@ -5,7 +5,7 @@ A run folder holds
     checkpoints/<step>/   orbax: `trainable`, `optimizer`, and `iterator` (the position in the data, JSON)
     base/                 orbax: the frozen variables, written once; absent when everything is trained
 
-Weights imported from elsewhere are a folder of their own (`save_weights`).
+Weights imported from elsewhere are a folder of their own (`dsvla_jax.weights.folder`).
 """
 
 import dataclasses
@@ -163,41 +163,6 @@ class RunCheckpoints:
         """Waits until everything is on disk."""
         self._manager.wait_until_finished()
         self._manager.close()
-
-
-def save_weights(folder: Path, params: Any, description: dict[str, Any]) -> None:
-    """Writes parameters, and what must be known to use them (JSON), to a new folder: it appears whole or not at all."""
-    if folder.exists():
-        raise CheckpointError(f"{folder} exists already; remove it, or choose another folder")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with _weights_checkpointer() as checkpointer:
-        args = ocp.args.Composite(params=ocp.args.StandardSave(params), description=ocp.args.JsonSave(description))
-        checkpointer.save(folder.absolute(), args)
-
-
-def describe_weights(folder: Path) -> dict[str, Any]:
-    """The description that `save_weights` wrote. Raises CheckpointError where it did not write this folder."""
-    if not (folder / "description").is_dir() or not (folder / "params").is_dir():
-        raise CheckpointError(
-            f"{folder}: no imported weights here; write them with: python -m dsvla_jax.weights import"
-        )
-    with _weights_checkpointer() as checkpointer:
-        args = ocp.args.Composite(description=ocp.args.JsonRestore())
-        return checkpointer.restore(folder.absolute(), args)["description"]
-
-
-def restore_weights(folder: Path, like: Any) -> Any:
-    """The parameters that `save_weights` wrote, with the structure, shapes, dtypes and shardings of `like`."""
-    with _weights_checkpointer() as checkpointer:
-        stored = checkpointer.metadata(folder.absolute()).item_metadata["params"]
-        require_same_shapes(stored, like, folder)
-        args = ocp.args.Composite(params=ocp.args.StandardRestore(_abstract(like)))
-        return checkpointer.restore(folder.absolute(), args)["params"]
-
-
-def _weights_checkpointer() -> ocp.Checkpointer:
-    handlers = {"params": ocp.StandardCheckpointHandler(), "description": ocp.JsonCheckpointHandler()}
-    return ocp.Checkpointer(ocp.CompositeCheckpointHandler(**handlers))
 
 
 def require_same_shapes(stored: Any, expected: Any, where: Path) -> None:

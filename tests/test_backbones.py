@@ -48,7 +48,7 @@ def run_llama(tower: Tower, tokens, positions, visible, attention: Any = "by_han
         hidden, _ = bound(bound.embed(tokens), positions, mask)
         return hidden, bound.lm_head(hidden)
 
-    return run(tower.params)
+    return run(tower.load())
 
 
 @pytest.mark.parametrize("name", [*LLAMAS, "llama_sharded"])
@@ -78,7 +78,7 @@ def test_llama_token_by_token_is_that_of_transformers(folders, name):
 
     cache, outputs = KVCache.empty(config, 1, length), []
     for index in range(length):
-        output, cache = step(tower.params, cache, jnp.asarray(index))
+        output, cache = step(tower.load(), cache, jnp.asarray(index))
         outputs.append(output)
     assert_close(np.concatenate(outputs, axis=1), hidden)
 
@@ -99,7 +99,7 @@ def run_clip(tower: Tower, size: int):
     model = VisionTower(ModelConfig(vision=tower.config))
     width = tower.config.width
     no_points = jnp.zeros((2, 0, width)), jnp.zeros((2, 0), jnp.int32)
-    return jax.jit(model.apply)({"params": tower.params}, draw_image(size), *no_points)
+    return jax.jit(model.apply)({"params": tower.load()}, draw_image(size), *no_points)
 
 
 @pytest.mark.parametrize("name", [*CLIPS, "clip"])
@@ -129,6 +129,6 @@ def test_every_parameter_is_read_once(folders, name):
     if name in CASES:
         shapes = CASES[name]["shapes"]
         stored = np.concatenate([draw(key, tuple(shape)).ravel() for key, shape in shapes.items()])
-        read = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tower.params)])
+        read = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tower.load())])
         np.testing.assert_array_equal(np.sort(read), np.sort(stored))
     assert not [key for key in tower.unused if key.startswith(("model.", "vision_model."))]

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -10,14 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import CheckpointError, save_weights
+from dsvla_jax.checkpoints import CheckpointError
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, RopeScaling, VisionConfig
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
 from dsvla_jax.weights import __main__ as program
 from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.folder import create_weights
 from dsvla_jax.weights.positions import resample_positions
-from dsvla_jax.weights.safetensors import WeightsError, list_tensors
+from dsvla_jax.weights.safetensors import list_tensors
+from dsvla_jax.weights.tensors import WeightsError
 from dsvla_jax.weights.towers import read_language, read_vision, summarize
 from tests.golden.backbones import draw
 from tests.safetensors_files import write_checkpoint
@@ -51,10 +55,10 @@ def test_llama_behind_any_prefix(tmp_path, prefix):
     head = tensors.pop("lm_head.weight")
     renamed = {prefix + key.removeprefix("model."): value for key, value in tensors.items()}
     renamed[prefix.removesuffix("model.") + "lm_head.weight"] = head
-    tower = read_language(write_checkpoint(tmp_path / "source", CASES["plain"]["config"], renamed))
-    np.testing.assert_array_equal(tower.params["output"], head.T)
+    params = read_language(write_checkpoint(tmp_path / "source", CASES["plain"]["config"], renamed)).load()
+    np.testing.assert_array_equal(params["output"], head.T)
     np.testing.assert_array_equal(
-        tower.params["layers"]["down"]["kernel"][1], tensors["model.layers.1.mlp.down_proj.weight"].T
+        params["layers"]["down"]["kernel"][1], tensors["model.layers.1.mlp.down_proj.weight"].T
     )
 
 
@@ -68,14 +72,14 @@ def test_clip_behind_any_prefix_and_within_other_configs(tmp_path, prefix):
     tower = read_vision(write_checkpoint(tmp_path / "source", config, tensors))
     assert tower.unused == (("elsewhere.weight",) if prefix else ())
     kernel = tensors[prefix + "embeddings.patch_embedding.weight"]
-    np.testing.assert_array_equal(tower.params["patch_kernel"][1, 2, 0], kernel[:, 0, 1, 2])
+    np.testing.assert_array_equal(tower.load()["patch_kernel"][1, 2, 0], kernel[:, 0, 1, 2])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float16, jnp.bfloat16])
 def test_every_dtype_is_read_exactly(tmp_path, dtype):
     tensors = {key: value.astype(dtype) for key, value in case_tensors("grouped_tied").items()}
     tower = read_language(write_checkpoint(tmp_path / "source", CASES["grouped_tied"]["config"], tensors))
-    table = tower.params["embedding"]
+    table = tower.load()["embedding"]
     assert table.dtype == np.float32
     np.testing.assert_array_equal(table, tensors["model.embed_tokens.weight"].astype(np.float32))
 
@@ -269,7 +273,7 @@ def test_imported_folder_gives_back_configs_and_params(imported):
     assert stored.vision == towers["vision"].config
     assert isinstance(stored.vision, VisionConfig)
     assert stored.vision.image_size == 15
-    assert_same(load_backbones(out), {name: tower.params for name, tower in towers.items()})
+    assert_same(load_backbones(out), {name: tower.load() for name, tower in towers.items()})
 
 
 def test_a_model_runs_from_an_imported_folder(imported):
@@ -298,23 +302,47 @@ def test_bfloat16_on_disk_is_float32_in_the_model(tmp_path):
     import_backbones(GOLDEN / "llama_sharded", tmp_path / "half", dtype=jnp.bfloat16)
     params = load_backbones(tmp_path / "half")
     assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype(jnp.float32)}
-    assert_same(params["language"], read_language(GOLDEN / "llama_sharded").params)
+    assert_same(params["language"], read_language(GOLDEN / "llama_sharded").load())
     assert read_towers(tmp_path / "half").vision is None
 
 
 def test_a_failed_write_leaves_no_folder(tmp_path):
+    def write():
+        leaves = {"a": jax.ShapeDtypeStruct((3,), np.float32)}
+        with create_weights(tmp_path / "out", leaves, "/layers/", {"not JSON": object()}) as arrays:
+            arrays["a"][...] = np.ones(3, np.float32)
+
     with pytest.raises(TypeError):
-        save_weights(tmp_path / "out", {"a": np.ones(3, np.float32)}, {"not JSON": object()})
-    assert not (tmp_path / "out").exists()
+        write()
+    assert not list(tmp_path.iterdir())
 
 
-def test_what_a_killed_import_left_is_no_hindrance(tmp_path):
-    partial = tmp_path / "out.orbax-checkpoint-tmp" / "params"
-    partial.mkdir(parents=True)
-    (partial / "manifest.ocdbt").write_bytes(b"half of it")
-    import_backbones(GOLDEN / "llama_sharded", tmp_path / "out")
+KILLED = """
+import os, signal
+from pathlib import Path
+from dsvla_jax.weights import base, towers
+
+def copy_to(self, array, dtype):
+    if self.path.startswith("layers/down"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    copy(self, array, dtype)
+
+copy, towers.Piece.copy_to = towers.Piece.copy_to, copy_to
+base.import_backbones(Path({source!r}), Path({out!r}))
+"""
+
+
+def test_a_killed_import_looks_like_none_and_is_no_hindrance(tmp_path):
+    out = tmp_path / "out"
+    code = KILLED.format(source=str(GOLDEN / "llama_sharded"), out=str(out))
+    assert subprocess.run([sys.executable, "-c", code], cwd=GOLDEN.parents[1]).returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert left != out
+    with pytest.raises(CheckpointError, match="no imported weights here"):
+        load_backbones(left)
+    import_backbones(GOLDEN / "llama_sharded", out)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    load_backbones(tmp_path / "out")
+    load_backbones(out)
 
 
 def test_an_existing_folder_is_not_touched(tmp_path):
@@ -322,6 +350,55 @@ def test_an_existing_folder_is_not_touched(tmp_path):
     with pytest.raises(CheckpointError, match="exists already"):
         import_backbones(GOLDEN / "llama_sharded", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+SHARDED = """
+import json, sys
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from pathlib import Path
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+from dsvla_jax.weights.base import backbone_shapes, load_backbones
+
+jax.config.update("jax_num_cpu_devices", 4)
+mesh = jax.make_mesh((2, 2), ("fsdp", "tensor"), axis_types=(AxisType.Auto,) * 2)
+
+def sharded(leaf):
+    matrix = leaf.ndim > 1 and not any(size % 2 for size in leaf.shape[-2:])
+    spec = PartitionSpec(*[None] * (leaf.ndim - 2), "fsdp", "tensor") if matrix else PartitionSpec()
+    return jax.ShapeDtypeStruct(leaf.shape, jax.numpy.bfloat16, sharding=NamedSharding(mesh, spec))
+
+folder = Path(sys.argv[1])
+like = jax.tree.map(sharded, backbone_shapes(folder))
+params, whole = load_backbones(folder, like), load_backbones(folder)
+with ocp.StandardCheckpointer() as checkpointer:
+    by_orbax = checkpointer.restore(folder.absolute() / "params", like)
+
+def check(asked, given, other, expected):
+    assert given.dtype == jax.numpy.bfloat16 and given.sharding == asked.sharding, (given.sharding, asked.sharding)
+    assert len(given.addressable_shards) == 4
+    expected = np.asarray(expected.astype(jax.numpy.bfloat16))
+    for mine, theirs in zip(given.addressable_shards, other.addressable_shards, strict=True):
+        assert mine.data.shape == asked.sharding.shard_shape(asked.shape)
+        np.testing.assert_array_equal(np.asarray(mine.data), expected[mine.index])
+        np.testing.assert_array_equal(np.asarray(mine.data), np.asarray(theirs.data))
+    return given.addressable_shards[0].data.nbytes / given.nbytes
+
+print(json.dumps(jax.tree.map(check, like, params, by_orbax, whole)))
+"""
+
+
+def test_each_device_is_given_its_shard(imported):
+    """And orbax alone, without this project, restores the folder too."""
+    out, _ = imported
+    command = [sys.executable, "-c", SHARDED, str(out)]
+    finished = subprocess.run(command, cwd=GOLDEN.parents[1], capture_output=True, text=True)
+    assert finished.returncode == 0, finished.stderr
+    shares = json.loads(finished.stdout)
+    assert shares["language"]["layers"]["gate"]["kernel"] == 0.25
+    assert shares["vision"]["layers"]["o"]["kernel"] == 0.25
+    assert shares["language"]["norm"]["scale"] == 1
 
 
 def test_folders_that_are_no_imports_say_so(tmp_path):

@@ -11,7 +11,6 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
@@ -47,8 +46,7 @@ def import_command(
     """
     towers = import_backbones(source, out, vision, image_size, DTYPES[dtype], projection)
     for name, tower in towers.items():
-        size = sum(leaf.size for leaf in jax.tree.leaves(tower.params))
-        print(f"{name}: {size:,} parameters, {tower.config}")
+        print(f"{name}: {tower.size:,} parameters, {tower.config}")
         if tower.unused:
             print(f"{name}: left alone: {summarize(tower.unused)}")
     print(f"written: {out}")

@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import cattrs
+import jax
 import numpy as np
 
-from dsvla_jax.checkpoints import CheckpointError, describe_weights, restore_weights, save_weights
+from dsvla_jax.checkpoints import CheckpointError
 from dsvla_jax.model.config import LanguageConfig, VisionConfig
-from dsvla_jax.weights.safetensors import WeightsError
+from dsvla_jax.weights.folder import create_weights, describe_weights, restore_weights
+from dsvla_jax.weights.tensors import WeightsError
 from dsvla_jax.weights.towers import Tower, read_language, read_vision, tower_shapes
 
 
@@ -32,20 +34,26 @@ def import_backbones(
     dtype: Any = np.float32,
     projection: bool = False,
 ) -> dict[str, Tower]:
-    """Reads the towers of Hugging Face folders and writes them to ``out``, a new folder, whole or not at all.
+    """Writes the towers of Hugging Face folders to ``out``, a new folder, whole or not at all.
 
-    image_size, projection: see `read_vision`. dtype: of what is kept on disk. Returns what was read, by tower.
+    In memory are few rows of a tensor at a time. image_size, projection: see `read_vision`. dtype: of what is kept on
+    disk. Returns what was written, by tower.
     Raises WeightsError where a source does not fit, CheckpointError where ``out`` exists.
     """
-    if out.exists():  # told before minutes of reading
-        raise CheckpointError(f"{out} exists already; remove it, or choose another folder")
     if vision_source is None and (image_size is not None or projection):
         raise WeightsError("image size and projection are the vision tower's: name the folder that has one (--vision)")
-    towers = {"language": read_language(source, dtype)}
+    towers = {"language": read_language(source)}
     if vision_source is not None:
-        towers["vision"] = read_vision(vision_source, image_size, dtype, projection)
+        towers["vision"] = read_vision(vision_source, image_size, projection)
     sizes = Towers(**{"vision": None} | {name: tower.config for name, tower in towers.items()})  # pyright: ignore
-    save_weights(out, {name: tower.params for name, tower in towers.items()}, dataclasses.asdict(sizes))
+    leaves = {
+        f"{name}/{path}": jax.ShapeDtypeStruct(shape, dtype)
+        for name, tower in towers.items()
+        for path, shape in tower.shapes.items()
+    }
+    with create_weights(out, leaves, "/layers/", dataclasses.asdict(sizes)) as arrays:
+        for name, tower in towers.items():
+            tower.copy_to({path: arrays[f"{name}/{path}"] for path in tower.shapes}, dtype)
     return towers
 
 
@@ -58,13 +66,19 @@ def read_towers(folder: Path) -> Towers:
         raise CheckpointError(f"{folder}: not weights of this version: {details}; import them again") from error
 
 
-def load_backbones(folder: Path) -> dict[str, Any]:
-    """The params of the towers in a folder, float32, by tower: they replace those of a model of `read_towers`' sizes.
+def backbone_shapes(folder: Path) -> dict[str, Any]:
+    """The params of the towers in a folder, by tower, as float32 ShapeDtypeStructs."""
+    towers = read_towers(folder)
+    shapes = {"language": tower_shapes(towers.language)}
+    if towers.vision is not None:
+        shapes["vision"] = tower_shapes(towers.vision)
+    return shapes
 
+
+def load_backbones(folder: Path, like: Any = None) -> dict[str, Any]:
+    """The params of the towers in a folder, by tower: they replace those of a model of `read_towers`' sizes.
+
+    like: what `backbone_shapes` gives, with the dtypes and shardings that are wanted; None for float32 on one device.
     Raises CheckpointError where the folder does not hold them.
     """
-    towers = read_towers(folder)
-    like = {"language": tower_shapes(towers.language)}
-    if towers.vision is not None:
-        like["vision"] = tower_shapes(towers.vision)
-    return restore_weights(folder, like)
+    return restore_weights(folder, backbone_shapes(folder) if like is None else like)

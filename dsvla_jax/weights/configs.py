@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from dsvla_jax.model.config import LanguageConfig, RopeScaling, VisionConfig
-from dsvla_jax.weights.safetensors import WeightsError, read_json
+from dsvla_jax.weights.safetensors import read_json
+from dsvla_jax.weights.tensors import WeightsError
 
 CONFIG = "config.json"
 

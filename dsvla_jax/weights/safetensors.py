@@ -5,51 +5,14 @@ count from behind the JSON). A checkpoint in several files has an index, {"weigh
 https://github.com/huggingface/safetensors (README, "Format").
 """
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
+from dsvla_jax.weights.tensors import AGAIN, StoredTensor, WeightsError
 
-from dsvla_jax.errors import UserError
-
-FLOATS = {"F32": np.dtype(np.float32), "F16": np.dtype(np.float16), "BF16": np.dtype(jnp.bfloat16)}
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
-AGAIN = "download it again"
-
-
-class WeightsError(UserError):
-    """A checkpoint of another project is missing, damaged, or of a kind that does not fit here."""
-
-
-@dataclasses.dataclass(frozen=True)
-class StoredTensor:
-    """Where one tensor lies. begin: its first byte, from the start of the file."""
-
-    key: str
-    file: Path
-    dtype: str
-    shape: tuple[int, ...]
-    begin: int
-    end: int
-
-    def read(self) -> np.ndarray:
-        """The tensor as it is stored: a read-only array over the mapped file, loaded as it is used."""
-        dtype = FLOATS.get(self.dtype)
-        if dtype is None:
-            raise WeightsError(
-                f"{self.file}: {self.key}: expected dtype {', '.join(FLOATS)}, found {self.dtype}; "
-                "use an unquantised checkpoint"
-            )
-        if self.end - self.begin != int(np.prod(self.shape)) * dtype.itemsize:
-            raise WeightsError(
-                f"{self.file}: {self.key}: {self.dtype} {self.shape} does not fill the {self.end - self.begin} bytes "
-                f"that the header gives it: the file is damaged; {AGAIN}"
-            )
-        return np.memmap(self.file, dtype, "r", offset=self.begin, shape=self.shape)
 
 
 def read_json(file: Path) -> dict[str, Any]:

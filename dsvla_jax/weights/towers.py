@@ -5,6 +5,7 @@ front of them ("model.", "vision_model.", "vision_tower.vision_model.", nothing)
 """
 
 import dataclasses
+import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -22,7 +23,8 @@ from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.llama import Llama
 from dsvla_jax.weights.configs import read_language_config, read_vision_config
 from dsvla_jax.weights.positions import resample_positions
-from dsvla_jax.weights.safetensors import StoredTensor, WeightsError, list_tensors
+from dsvla_jax.weights.safetensors import list_tensors
+from dsvla_jax.weights.tensors import StoredTensor, WeightsError
 
 LLAMA_NAMES = {
     "embedding": "embed_tokens.weight",
@@ -61,20 +63,75 @@ AXES = {"kernel": (1, 0), "output": (1, 0), "projection": (1, 0), "patch_kernel"
 BUFFERS = ("rotary_emb.inv_freq", "embeddings.position_ids")
 
 
+# Rows of a stored tensor that are in memory at a time; as many make a chunk of the folder that is written.
+ROWS = 2048
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A stored tensor, and what it becomes: the parameter at ``path``, or one layer of it.
+
+    axes: which of the stored axes becomes each of ours.
+    """
+
+    path: str
+    layer: int | None
+    tensor: StoredTensor
+    axes: tuple[int, ...]
+
+    def copy_to(self, array: Any, dtype: Any) -> None:
+        """Writes the tensor, some rows at a time, to the parameter's array (NumPy or on disk) of ``dtype``."""
+        place = self.axes.index(0)
+        for start in range(0, self.tensor.shape[0], ROWS):
+            rows = self.tensor.read(start, min(start + ROWS, self.tensor.shape[0]))
+            index: list[Any] = [slice(None)] * len(self.axes)
+            index[place] = slice(start, start + len(rows))
+            whole_index = tuple(index) if self.layer is None else (self.layer, *index)
+            array[whole_index] = rows.transpose(self.axes).astype(dtype)
+
+
 @dataclasses.dataclass(frozen=True)
 class Tower:
-    """What was read. params: nested dict of arrays, layers stacked. unused: keys of the checkpoint left alone."""
+    """A tower of a checkpoint whose tensors are all there, and not read yet.
+
+    shapes: of its parameters by path, layers stacked. computed: those that are not as they are stored, float32.
+    unused: keys of the checkpoint left alone.
+    """
 
     config: LanguageConfig | VisionConfig
-    params: dict[str, Any]
+    shapes: Mapping[str, tuple[int, ...]]
+    pieces: tuple[Piece, ...]
+    computed: Mapping[str, np.ndarray]
     unused: tuple[str, ...]
 
+    @property
+    def size(self) -> int:
+        """How many numbers it has."""
+        return sum(math.prod(shape) for shape in self.shapes.values())
 
-def read_language(folder: Path, dtype: Any = np.float32) -> Tower:
-    """The LLaMA decoder of a checkpoint: params of `dsvla_jax.model.llama.Llama` in ``dtype``.
+    def copy_to(self, arrays: Mapping[str, Any], dtype: Any) -> None:
+        """Fills the arrays (NumPy or on disk) of its parameters; few rows of one tensor are in memory at a time."""
+        for path, values in self.computed.items():
+            arrays[path][...] = values.astype(dtype)
+        pieces = [piece for piece in self.pieces if piece.path not in self.computed]
+        size = sum(math.prod(piece.tensor.shape) for piece in pieces)
+        with tqdm(total=size, desc="import", unit="number", unit_scale=True, disable=None) as bar:
+            for piece in pieces:
+                piece.copy_to(arrays[piece.path], dtype)
+                bar.update(math.prod(piece.tensor.shape))
 
-    Reads a tensor at a time. Raises WeightsError naming file and key where anything is missing, left over within the
-    decoder, or of another shape than config.json says.
+    def load(self, dtype: Any = np.float32) -> dict[str, Any]:
+        """Its parameters in memory, a nested dict."""
+        arrays = {path: np.empty(shape, dtype) for path, shape in self.shapes.items()}
+        self.copy_to(arrays, dtype)
+        return traverse_util.unflatten_dict(arrays, sep="/")
+
+
+def read_language(folder: Path) -> Tower:
+    """The LLaMA decoder of a checkpoint: params of `dsvla_jax.model.llama.Llama`.
+
+    Raises WeightsError naming file and key where anything is missing, left over within the decoder, of another shape
+    than config.json says, or of numbers that are not read here.
     """
     config = read_language_config(folder)
     tensors = list_tensors(folder)
@@ -83,16 +140,11 @@ def read_language(folder: Path, dtype: Any = np.float32) -> Tower:
     names = {ours: prefix + theirs for ours, theirs in LLAMA_NAMES.items()}
     if not config.tie_embeddings:
         names["output"] = head
-    params, unused = _fill(
-        tower_shapes(config), names, tensors, prefix, (LM_HEAD,) if config.tie_embeddings else (), dtype
-    )
-    return Tower(config, params, unused)
+    return _assign(config, names, tensors, prefix, (LM_HEAD,) if config.tie_embeddings else ())
 
 
-def read_vision(
-    folder: Path, image_size: int | None = None, dtype: Any = np.float32, projection: bool = False
-) -> Tower:
-    """The CLIP vision tower of a checkpoint: params of `dsvla_jax.model.clip.VisionTower` in ``dtype``.
+def read_vision(folder: Path, image_size: int | None = None, projection: bool = False) -> Tower:
+    """The CLIP vision tower of a checkpoint: params of `dsvla_jax.model.clip.VisionTower`.
 
     image_size: pixels; None for the checkpoint's own. Positional embeddings are resampled to another size's grid.
     projection: read the projection into CLIP's joint embedding too, which only whole CLIP models have.
@@ -107,14 +159,23 @@ def read_vision(
         if key not in tensors:
             raise WeightsError(f"{folder}: {key} is missing: this is a vision tower without CLIP's projection")
         config = dataclasses.replace(config, embed_width=tensors[key].shape[0])
-    params, unused = _fill(tower_shapes(config), names, tensors, prefix, (), dtype)
-    if image_size is not None and image_size != config.image_size:
-        try:
-            config = dataclasses.replace(config, image_size=image_size)
-        except ValueError as error:
-            raise WeightsError(f"image size {image_size} does not suit the tower in {folder}: {error}") from error
-        params["positional_embedding"] = resample_positions(params["positional_embedding"], config.grid).astype(dtype)
-    return Tower(config, params, unused)
+    tower = _assign(config, names, tensors, prefix, ())
+    return tower if image_size is None else _resample(tower, image_size, folder)
+
+
+def _resample(tower: Tower, image_size: int, source: Path) -> Tower:
+    """The vision tower for images of another size."""
+    try:
+        config = dataclasses.replace(tower.config, image_size=image_size)
+    except ValueError as error:
+        raise WeightsError(f"image size {image_size} does not suit the tower in {source}: {error}") from error
+    assert isinstance(config, VisionConfig)
+    name = "positional_embedding"
+    stored = next(piece.tensor for piece in tower.pieces if piece.path == name)
+    positions = resample_positions(stored.read().astype(np.float32), config.grid)
+    return dataclasses.replace(
+        tower, config=config, shapes={**tower.shapes, name: positions.shape}, computed={name: positions}
+    )
 
 
 def tower_shapes(config: LanguageConfig | VisionConfig) -> dict[str, Any]:
@@ -148,16 +209,15 @@ def _find_prefix(tensors: Mapping[str, StoredTensor], name: str, folder: Path) -
     return found[0]
 
 
-def _fill(
-    shapes: Mapping[str, Any],
+def _assign(
+    config: LanguageConfig | VisionConfig,
     names: Mapping[str, str],
     tensors: Mapping[str, StoredTensor],
     prefix: str,
     droppable: tuple[str, ...],
-    dtype: Any,
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Arrays for the tree of ``shapes`` from ``names`` (theirs for each of ours), and the keys that were not needed."""
-    flat: dict[str, Any] = traverse_util.flatten_dict(shapes, sep="/")
+) -> Tower:
+    """The tower of ``config`` from ``names`` (theirs for each of ours). Every tensor that it needs is checked."""
+    flat: dict[str, Any] = traverse_util.flatten_dict(tower_shapes(config), sep="/")
     places: dict[str, tuple[str, int | None]] = {}
     for ours, leaf in flat.items():
         if ours.startswith("layers/"):
@@ -177,12 +237,13 @@ def _fill(
         ]
         raise WeightsError(f"{folder}: its tensors do not fit its config.json: {'; '.join(problems)}")
 
-    arrays = {ours: np.empty(leaf.shape, dtype) for ours, leaf in flat.items()}
-    for key, (ours, layer) in tqdm(places.items(), desc="read", unit="tensor", disable=None):
-        tensor, target = tensors[key], arrays[ours] if layer is None else arrays[ours][layer]
-        axes = AXES.get(ours.rsplit("/", 1)[-1], tuple(range(target.ndim)))
-        expected = tuple(target.shape[axes.index(axis)] for axis in range(target.ndim))
+    pieces = []
+    for key, (ours, layer) in places.items():
+        tensor, shape = tensors[key], flat[ours].shape if layer is None else flat[ours].shape[1:]
+        axes = AXES.get(ours.rsplit("/", 1)[-1], tuple(range(len(shape))))
+        expected = tuple(shape[axes.index(axis)] for axis in range(len(shape)))
         if tensor.shape != expected:
             raise WeightsError(f"{tensor.file}: {key}: expected shape {expected} by config.json, found {tensor.shape}")
-        target[...] = tensor.read().transpose(axes)
-    return traverse_util.unflatten_dict(arrays, sep="/"), unused
+        tensor.check()
+        pieces.append(Piece(ours, layer, tensor, axes))
+    return Tower(config, {path: leaf.shape for path, leaf in flat.items()}, tuple(pieces), {}, unused)

@@ -1,0 +1,91 @@
+"""The folder of imported weights, which is written in pieces and read in shards, so that neither needs them whole.
+
+description.json    what must be known to use them; written last
+params/             an orbax checkpoint of a PyTree, its arrays in zarr chunks
+"""
+
+import contextlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+import tensorstore as ts
+from flax import traverse_util
+
+from dsvla_jax.checkpoints import CheckpointError, require_same_shapes
+
+DESCRIPTION, PARAMS = "description.json", "params"
+# Numbers along each side of a chunk: 8 MB of bfloat16. A chunk is read whole by each device that needs a part of it.
+CHUNK = 2048
+
+
+@contextlib.contextmanager
+def create_weights(
+    folder: Path, leaves: Mapping[str, jax.ShapeDtypeStruct], stacked: str, description: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """A new folder of weights: it appears when the block ends, and not at all where it raises or is killed.
+
+    leaves: by path ("language/layers/q/kernel"). stacked: the part of a path that says that the leading axis counts
+    layers, which are chunked apart. Yields an array on disk for each leaf: ``arrays[path][index] = values`` writes.
+    """
+    if folder.exists():
+        raise CheckpointError(f"{folder} exists already; remove it, or choose another folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = folder.absolute().with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        # Orbax would hold every array in memory to write it. It writes the tree, of arrays with one number each, and
+        # the arrays are then made anew in their real sizes.
+        tree = traverse_util.unflatten_dict(
+            {path: np.zeros((1,) * leaf.ndim, leaf.dtype) for path, leaf in leaves.items()}, sep="/"
+        )
+        (partial / PARAMS).mkdir(parents=True)
+        handler = ocp.PyTreeCheckpointHandler(use_ocdbt=False)
+        handler.save(partial / PARAMS, args=ocp.args.PyTreeSave(tree))  # pyright: ignore[reportArgumentType]
+        handler.close()
+        yield {path: _create_array(partial, path, leaf, stacked in path) for path, leaf in leaves.items()}
+        (partial / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
+        partial.rename(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _create_array(folder: Path, path: str, leaf: jax.ShapeDtypeStruct, stacked: bool) -> Any:
+    chunks = [1 if stacked and axis == 0 else min(size, CHUNK) for axis, size in enumerate(leaf.shape)]
+    spec = {
+        "driver": "zarr",
+        "kvstore": {"driver": "file", "path": f"{folder / PARAMS / path.replace('/', '.')}/"},
+        "metadata": {"chunks": chunks, "compressor": {"id": "zstd", "level": 1}},
+    }
+    return ts.open(spec, create=True, delete_existing=True, shape=leaf.shape, dtype=ts.dtype(leaf.dtype)).result()
+
+
+def describe_weights(folder: Path) -> dict[str, Any]:
+    """The description of a folder that `create_weights` made. Raises CheckpointError where it made none here."""
+    file = folder / DESCRIPTION
+    if not file.is_file():
+        raise CheckpointError(
+            f"{folder}: no imported weights here; write them with: python -m dsvla_jax.weights import"
+        )
+    try:
+        return json.loads(file.read_text())
+    except ValueError as error:
+        raise CheckpointError(f"{file}: not JSON ({error}); import the weights again") from error
+
+
+def restore_weights(folder: Path, like: Any) -> Any:
+    """The parameters of a folder, with the structure, shapes, dtypes and shardings of ``like``.
+
+    A device is given its shard and no more, and a host reads the chunks of its own devices' shards.
+    Raises CheckpointError where structure or shapes differ.
+    """
+    path = folder.absolute() / PARAMS
+    with ocp.StandardCheckpointer() as checkpointer:
+        require_same_shapes(checkpointer.metadata(path).item_metadata, like, folder)
+        return checkpointer.restore(path, jax.tree.map(ocp.utils.to_shape_dtype_struct, like))
