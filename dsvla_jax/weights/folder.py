@@ -16,6 +16,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import tensorstore as ts
 from flax import traverse_util
+from jax.sharding import SingleDeviceSharding
 
 from dsvla_jax.checkpoints import CheckpointError, require_same_shapes
 
@@ -39,8 +40,7 @@ def create_weights(
     partial = folder.absolute().with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        # Orbax would hold every array in memory to write it. It writes the tree, of arrays with one number each, and
-        # the arrays are then made anew in their real sizes.
+        # Orbax writes the tree, with one number in each array; the arrays are then made anew in their real sizes.
         tree = traverse_util.unflatten_dict(
             {path: np.zeros((1,) * leaf.ndim, leaf.dtype) for path, leaf in leaves.items()}, sep="/"
         )
@@ -58,12 +58,13 @@ def create_weights(
 
 def _create_array(folder: Path, path: str, leaf: jax.ShapeDtypeStruct, stacked: bool) -> Any:
     chunks = [1 if stacked and axis == 0 else min(size, CHUNK) for axis, size in enumerate(leaf.shape)]
-    spec = {
-        "driver": "zarr",
-        "kvstore": {"driver": "file", "path": f"{folder / PARAMS / path.replace('/', '.')}/"},
-        "metadata": {"chunks": chunks, "compressor": {"id": "zstd", "level": 1}},
-    }
+    metadata = {"chunks": chunks, "compressor": {"id": "zstd", "level": 1}}
+    spec = _spec(folder / PARAMS / path.replace("/", ".")) | {"metadata": metadata}
     return ts.open(spec, create=True, delete_existing=True, shape=leaf.shape, dtype=ts.dtype(leaf.dtype)).result()
+
+
+def _spec(array: Path) -> dict[str, Any]:
+    return {"driver": "zarr", "kvstore": {"driver": "file", "path": f"{array.absolute()}/"}}
 
 
 def describe_weights(folder: Path) -> dict[str, Any]:
@@ -82,10 +83,18 @@ def describe_weights(folder: Path) -> dict[str, Any]:
 def restore_weights(folder: Path, like: Any) -> Any:
     """The parameters of a folder, with the structure, shapes, dtypes and shardings of ``like``.
 
-    A device is given its shard and no more, and a host reads the chunks of its own devices' shards.
+    A device is given its shard and no more. A host reads the chunks of its own devices' shards, an array at a time.
     Raises CheckpointError where structure or shapes differ.
     """
-    path = folder.absolute() / PARAMS
-    with ocp.StandardCheckpointer() as checkpointer:
-        require_same_shapes(checkpointer.metadata(path).item_metadata, like, folder)
-        return checkpointer.restore(path, jax.tree.map(ocp.utils.to_shape_dtype_struct, like))
+    stored = {
+        array.name: ts.open(_spec(array), open=True).result() for array in (folder / PARAMS).iterdir() if array.is_dir()
+    }
+    tree = traverse_util.unflatten_dict(stored, sep=".")
+    require_same_shapes(tree, like, folder)
+    return jax.tree.map(_restore_array, tree, like)
+
+
+def _restore_array(store: Any, like: jax.ShapeDtypeStruct) -> jax.Array:
+    sharding = like.sharding or SingleDeviceSharding(jax.devices()[0])
+    values = ts.cast(store, ts.dtype(like.dtype))
+    return jax.make_array_from_callback(like.shape, sharding, lambda index: values[index].read().result())
