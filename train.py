@@ -6,7 +6,6 @@ config, the vocabulary, checkpoints, and metrics (metrics.jsonl and TensorBoard)
 
 import dataclasses
 import json
-import os
 import sys
 import time
 from pathlib import Path
@@ -21,10 +20,9 @@ from tqdm import tqdm
 
 import dsvla_jax.policy
 from configs import config_names, get_config
-from data_pipelines.demos import generate_demonstrations
-from data_pipelines.episodes import EpisodeReader
 from data_pipelines.loader import make_loader
 from data_pipelines.samples import make_sampler, suite_tokenizer
+from data_pipelines.sources import choose_tasks, open_demonstrations
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.text import WordTokenizer, load_tokenizer
@@ -32,7 +30,6 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
-from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.sharding import batch_sharding, replicate
 from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
@@ -41,7 +38,7 @@ from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
 def main(experiment: Experiment, run: Path, resume: bool) -> None:
     """Trains one experiment into the run folder, or goes on from its newest checkpoint."""
     tokenizer = tokenizer_of(experiment)
-    tasks = select_tasks(experiment.data.tasks)
+    tasks = choose_tasks(experiment.data)
     experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     prepare_run_folder(run, experiment, resume)
     checkpoints = RunCheckpoints(run)
@@ -50,16 +47,7 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
         print(f"{run} has been trained to step {experiment.steps}: nothing to do")
         return
     data = experiment.data
-    generate_demonstrations(
-        Path(data.folder),
-        tasks=data.tasks,
-        episodes=data.episodes,
-        image_size=data.image_size,
-        seed=data.seed,
-        perturb=data.perturb,
-        workers=os.cpu_count() or 1,
-    )
-    reader = EpisodeReader(Path(data.folder), tasks=data.tasks, episodes=data.episodes)
+    reader = open_demonstrations(data, tokenizer)
     sample = make_sampler(data, experiment.encoding, tokenizer)
     loader = make_loader(reader, sample, batch_size=experiment.batch_size, seed=experiment.seed)
 

@@ -24,15 +24,15 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_pipelines.episodes import INDEX_FILE, check_shard, read_index, write_index, write_shard
-from data_pipelines.records import MAX_DEPTH, DataError, Episode, make_episode
+from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
+from data_pipelines.records import Episode, make_episode, mark_missing
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
-from dsvla_jax.types import Action, Array
+from dsvla_jax.types import Action
 
 # Attempts, as a multiple of the episodes asked for, after which an expert counts as broken.
 MAX_ATTEMPTS = 10
@@ -152,21 +152,6 @@ class ScriptedExpert:
         return offsets
 
 
-def mark_missing(depth: np.ndarray) -> np.ndarray:
-    """Depth in metres with 0 wherever nothing was hit or it is too far for the format."""
-    return np.where(np.isfinite(depth) & (depth > 0) & (depth <= MAX_DEPTH), depth, 0)
-
-
-def replay_latch(end_effector: Array, keypoints: Array) -> Array:
-    """The keypoint each arm is heading for in every frame: positions (F, A, 3), keypoints (A, K, 3) -> (F, A, 3)."""
-
-    def look(latched: Array, position: Array) -> tuple[Array, Array]:
-        latched = advance_latch(latched, position, keypoints)
-        return latched, jax.vmap(active_keypoint)(latched, keypoints)
-
-    return jax.lax.scan(look, jnp.zeros(keypoints.shape[0], jnp.int32), end_effector)[1]
-
-
 def generate_demonstrations(
     folder: Path,
     tasks: Sequence[str],
@@ -186,7 +171,7 @@ def generate_demonstrations(
     """
     wanted = Settings(**settings)
     folder = Path(folder)
-    entries = {entry["file"]: entry for entry in existing_shards(folder, wanted)}
+    entries = {entry["file"]: entry for entry in existing_shards(folder, dataclasses.asdict(wanted))}
     missing = [task for task in tasks if not is_complete(folder, task, episodes, entries)]
     made, attempts = 0, 0
     with tqdm(total=episodes * len(tasks), desc="demonstrations", unit="episode", disable=not progress) as bar:
@@ -278,11 +263,6 @@ def _complete_and_tell(job: tuple[Any, ...], finished: Any) -> None:
     complete_task(*job, keep=lambda *shard: finished.put(shard))
 
 
-def shard_name(task: str, number: int) -> str:
-    """The file of a task's shard."""
-    return f"{task}-{number:05d}.array_record"
-
-
 def is_complete(folder: Path, task: str, episodes: int, entries: Mapping[str, dict[str, Any]]) -> bool:
     """Whether so many episodes of the task are there."""
     kept, number = 0, 0
@@ -302,18 +282,6 @@ def is_usable(folder: Path, entry: dict[str, Any], needed: int) -> bool:
         return False
     check_shard(folder, entry, digest=True)
     return True
-
-
-def existing_shards(folder: Path, wanted: Settings) -> list[dict[str, Any]]:
-    """The index entries of a folder made with the same settings; none where there is no index yet."""
-    if not (folder / INDEX_FILE).exists():
-        return []
-    index = read_index(folder)
-    for field, value in dataclasses.asdict(wanted).items():
-        if (found := index["settings"].get(field)) != value:
-            fix = "choose another folder, the same setting, or delete this folder"
-            raise DataError(folder / INDEX_FILE, f"settings.{field}", f"{value!r} as asked for", repr(found), fix)
-    return index["shards"]
 
 
 def main(options: Options) -> None:

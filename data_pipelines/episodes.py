@@ -14,11 +14,26 @@ from typing import Any, Literal
 import numpy as np
 from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
 
-from data_pipelines.records import DataError, Episode, Frame, decode_frame, pack_episode, unpack_episode
+from data_pipelines.records import (
+    DataError,
+    Episode,
+    Frame,
+    decode_frame,
+    pack_episode,
+    picture_size,
+    unpack_episode,
+)
 
 FORMAT_NAME = "dsvla-episodes"
 FORMAT_VERSION = 1
 INDEX_FILE = "index.json"
+
+_ONE_SIZE = "pictures of unlike sizes do not batch: resize them (intrinsics too), or write a folder for each size"
+
+
+def shard_name(task: str, number: int) -> str:
+    """The file of a task's shard."""
+    return f"{task}-{number:05d}.array_record"
 
 
 def file_digest(path: Path) -> str:
@@ -38,6 +53,9 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
         raise ValueError(
             f"shard {name}: expected episodes of {task} alike, got {sorted(kinds)}; write one shard a task"
         )
+    sizes = sorted({picture_size(png) for episode in episodes for png in (*episode.rgb_png, *episode.depth_png)})
+    if len(sizes) > 1:
+        raise DataError(folder / name, "picture size", "one (height, width) for all", str(sizes), _ONE_SIZE)
     temporary = folder / f"{name}.partial"
     # The pictures are compressed already; one record a chunk makes random access cheap.
     writer = array_record_module.ArrayRecordWriter(str(temporary), "group_size:1,uncompressed")
@@ -49,6 +67,8 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
         "task": task,
         "num_arms": episodes[0].num_arms if episodes else 0,
         "frames": [episode.num_frames for episode in episodes],
+        "picture_size": list(sizes[0]) if sizes else None,
+        "instructions": sorted({episode.instruction for episode in episodes}),
         "bytes": temporary.stat().st_size,
         "sha256": file_digest(temporary),
         **extra,
@@ -75,7 +95,7 @@ def write_index(folder: Path, shards: Sequence[dict[str, Any]], settings: dict[s
 def read_index(folder: Path) -> dict[str, Any]:
     """The checked contents of ``index.json``."""
     path = folder / INDEX_FILE
-    fix = "generate the demonstrations with `python -m data_pipelines.demos`"
+    fix = "write demonstrations there with `python -m data_pipelines.demos`, or import some (docs/data_own.md)"
     if not path.is_file():
         raise DataError(path, "file", "an index of demonstrations", "no such file", fix)
     try:
@@ -87,6 +107,21 @@ def read_index(folder: Path) -> dict[str, Any]:
     if index.get("version") != FORMAT_VERSION:
         raise DataError(path, "version", str(FORMAT_VERSION), repr(index.get("version")), fix + " again")
     return index
+
+
+def existing_shards(folder: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """The index entries of a folder made with the same settings, for whoever continues it; none where there is none.
+
+    Raises DataError where it was made with other settings.
+    """
+    if not (folder / INDEX_FILE).exists():
+        return []
+    index = read_index(folder)
+    for field, value in settings.items():
+        if (found := index["settings"].get(field)) != value:
+            fix = "choose another folder, the same setting, or delete this folder"
+            raise DataError(folder / INDEX_FILE, f"settings.{field}", f"{value!r} as asked for", repr(found), fix)
+    return index["shards"]
 
 
 def check_shard(folder: Path, entry: dict[str, Any], digest: bool = False) -> None:
@@ -110,7 +145,7 @@ def write_episodes(folder: Path | str, episodes: Iterable[Episode], per_shard: i
     shards = []
     for task, group in sorted(by_task.items()):
         for start in range(0, len(group), per_shard):
-            name = f"{task}-{start // per_shard:05d}.array_record"
+            name = shard_name(task, start // per_shard)
             shards.append(write_shard(folder, name, task, group[start : start + per_shard]))
     write_index(folder, shards)
 
@@ -120,7 +155,9 @@ class EpisodeReader:
 
     Opening checks that every shard is complete; ``verify="sha256"`` reads them all and compares digests too.
     Episodes and frames are numbered through all shards, task by task, in the order in which they were written.
-    tasks: which tasks; all if None. episodes: only the first so many of each task; all if None.
+    `num_arms` is by task, `instructions` are those of the shards.
+    tasks: which tasks; all if None. episodes: only the first so many of each task; all if None. `fewer`: whether a task
+    may have fewer.
     """
 
     def __init__(
@@ -128,6 +165,7 @@ class EpisodeReader:
         folder: Path | str,
         tasks: Sequence[str] | None = None,
         episodes: int | None = None,
+        fewer: bool = False,
         verify: Literal["size", "sha256"] = "size",
     ):
         self.folder = Path(folder)
@@ -135,25 +173,35 @@ class EpisodeReader:
         present = sorted({entry["task"] for entry in index["shards"] if entry["frames"]})
         if missing := set(tasks or ()) - set(present):
             raise DataError(
-                self.folder, "tasks", f"some of {present}", str(sorted(missing)), "generate them or choose others"
+                self.folder,
+                "tasks",
+                f"some of {present}",
+                str(sorted(missing)),
+                "generate them, or choose others or all",
             )
         self.tasks = tuple(present if tasks is None else tasks)
         self.settings: dict[str, Any] = index["settings"]
-        self._shards = [shard for task in self.tasks for shard in self._choose(index["shards"], task, episodes)]
+        self._shards = [shard for task in self.tasks for shard in self._choose(index["shards"], task, episodes, fewer)]
         if not self._shards:
             raise DataError(self.folder, "shards", "at least one episode", "none", "generate demonstrations first")
         for entry in self._shards:
             check_shard(self.folder, entry, digest=verify == "sha256")
+        sizes = {tuple(entry["picture_size"]) for entry in self._shards if entry.get("picture_size")}
+        if len(sizes) > 1:
+            raise DataError(self.folder, "picture size", "one (height, width) for all", str(sorted(sizes)), _ONE_SIZE)
+        self.instructions = sorted({text for entry in self._shards for text in entry.get("instructions", ())})
         self.num_arms = {entry["task"]: entry["num_arms"] for entry in self._shards}
         self._first_episode = np.cumsum([0] + [len(entry["frames"]) for entry in self._shards])
         self._first_frame = np.cumsum([0] + [count for entry in self._shards for count in entry["frames"]])
         self._open: dict[int, Any] = {}
 
-    def _choose(self, shards: Sequence[dict[str, Any]], task: str, episodes: int | None) -> list[dict[str, Any]]:
+    def _choose(
+        self, shards: Sequence[dict[str, Any]], task: str, episodes: int | None, fewer: bool
+    ) -> list[dict[str, Any]]:
         """The task's shards, cut down to the first `episodes` of it."""
         mine = [shard for shard in shards if shard["task"] == task]
         count = sum(len(shard["frames"]) for shard in mine)
-        if episodes is not None and count < episodes:
+        if episodes is not None and count < episodes and not fewer:
             fix = f"run `python -m data_pipelines.demos {self.folder} --tasks {task} --episodes {episodes}`"
             raise DataError(self.folder, f"episodes of {task}", f"at least {episodes}", str(count), fix)
         chosen, left = [], count if episodes is None else episodes

@@ -8,6 +8,7 @@ Axes: F recorded frames of an episode, and A, H, W, K of ``dsvla_jax.types``. Wo
 """
 
 import dataclasses
+import struct
 from collections.abc import Sequence
 from typing import Any, TypedDict, cast
 
@@ -41,7 +42,8 @@ class Episode:
     intrinsics: float32 (F, 3, 3). world_from_camera: float32 (F, 4, 4).
     pose: float32 (F, A, 7). gripper_open: float32 (F, A). The state in which the frame was recorded.
     target_pose: float32 (F, A, 7). target_gripper: float32 (F, A). The next key pose.
-    keypoints: float32 (A, K, 3), in the order of the instruction. active_keypoint: float32 (F, A, 3).
+    keypoints: float32 (A, K, 3), in the order of the instruction. active_keypoint: float32 (F, A, 3). Where no keypoint
+        is known, K is 0 and active_keypoint (F, 0, 3): such a demonstration is prompted without the constraint.
     seed: the number of the episode in its seed stream.
     """
 
@@ -73,8 +75,8 @@ class Frame(TypedDict):
 
     rgb: uint8 (H, W, 3). depth: float32 (H, W), metres, 0 where missing. intrinsics: float32 (3, 3).
     world_from_camera: float32 (4, 4). pose: float32 (A, 7). gripper_open: float32 (A,). keypoint: float32 (A, 3), the
-    active one of each arm. target_pose: float32 (A, 7). target_gripper: float32 (A,). task_index: into
-    ``EpisodeReader.tasks``. episode: number in the reader. frame: number in the episode.
+    active one of each arm, or (0, 3) where none is known. target_pose: float32 (A, 7). target_gripper: float32 (A,).
+    task_index: into ``EpisodeReader.tasks``. episode: number in the reader. frame: number in the episode.
     """
 
     rgb: np.ndarray
@@ -133,6 +135,17 @@ def decode_depth(data: bytes) -> np.ndarray:
         raise DataError("decode_depth", "depth_png", "a 16-bit grey PNG", got, "generate the data again")
     # In float64 first, so that the nearest float32 of the decimal value comes out.
     return (picture * DEPTH_UNIT).astype(np.float32)
+
+
+def picture_size(png: bytes) -> tuple[int, int]:
+    """(height, width) that the header of a PNG states."""
+    width, height = struct.unpack(">II", png[16:24])
+    return height, width
+
+
+def mark_missing(depth: np.ndarray) -> np.ndarray:
+    """Depth in metres with 0 wherever nothing was hit or it is too far for the format."""
+    return np.where(np.isfinite(depth) & (depth > 0) & (depth <= MAX_DEPTH), depth, 0)
 
 
 def _png(picture: np.ndarray) -> bytes:
@@ -196,7 +209,7 @@ def check_episode(episode: Episode, where: object) -> None:
         "target_pose": (frames, arms, 7),
         "target_gripper": (frames, arms),
         "keypoints": (arms, keypoints, 3),
-        "active_keypoint": (frames, arms, 3),
+        "active_keypoint": (frames, arms if keypoints else 0, 3),
     }
     fix = "generate the data again, or correct the importer that wrote it"
     if frames == 0 or len(episode.depth_png) != frames:

@@ -52,7 +52,7 @@ def make_sampler(
             frame["instruction"],
             frame["pose"],
             frame["gripper_open"],
-            frame["keypoint"] if encoding.use_keypoints else None,
+            frame["keypoint"] if encoding.use_keypoints and len(frame["keypoint"]) else None,
         )
         bins = np.asarray(codec.encode(frame["target_pose"], frame["target_gripper"]))
         answer = format_answer(bins, encoding.style)

@@ -1,17 +1,20 @@
 """What a run learns from. On the lowest floor: the pipelines read it, and an experiment contains it."""
 
 import dataclasses
+from typing import Literal
 
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig:
-    """Scripted-expert demonstrations and what is varied each time a sample is drawn from them."""
+    """Demonstrations and what is varied each time a sample is drawn from them."""
 
+    source: Literal["simulator", "episodes"] = "simulator"
+    """`simulator`: scripted experts write what `folder` lacks; `episodes`: `folder` as it is, imported or one's own."""
     folder: str = "data/demos"
     tasks: tuple[str, ...] = ("lamp_on", "put_rubbish_in_bin", "close_fridge", "bimanual_lift_ball")
-    """Names of tasks, all, single_arm or dual_arm."""
+    """Names of tasks, all, single_arm or dual_arm; of imported or own demonstrations names or all."""
     episodes: int = 100
-    """Demonstrations a task."""
+    """Demonstrations a task; of imported or own ones, at most so many."""
     image_size: int = 96
     """Rendered pixels a side."""
     seed: int = 0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from data_pipelines import augment
-from data_pipelines.demos import ScriptedExpert, Settings, generate_demonstrations, mark_missing, replay_latch
+from data_pipelines.demos import ScriptedExpert, Settings, generate_demonstrations
 from data_pipelines.episodes import EpisodeReader, write_episodes
 from data_pipelines.loader import make_loader
 from data_pipelines.records import (
@@ -23,9 +23,11 @@ from data_pipelines.records import (
     encode_depth,
     encode_rgb,
     make_episode,
+    mark_missing,
     pack_episode,
     unpack_episode,
 )
+from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action
 

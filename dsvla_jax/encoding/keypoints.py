@@ -55,6 +55,17 @@ def advance_latch(
     return xp.sum(xp.cumprod(reached.astype(np.int32), axis=1), axis=1, dtype=np.int32)
 
 
+def replay_latch(end_effector: ArrayLike, keypoints: ArrayLike) -> Array:
+    """The keypoint each arm is heading for in every frame: positions (F, A, 3), keypoints (A, K, 3) -> (F, A, 3)."""
+    keypoints = jnp.asarray(keypoints)
+
+    def look(latched: Array, position: Array) -> tuple[Array, Array]:
+        latched = advance_latch(latched, position, keypoints)
+        return latched, jax.vmap(active_keypoint)(latched, keypoints)
+
+    return jax.lax.scan(look, jnp.zeros(keypoints.shape[0], jnp.int32), jnp.asarray(end_effector))[1]
+
+
 def perturb_keypoints(key: Array, keypoints: ArrayLike, max_offset: float = 0.03, probability: float = 0.5) -> Array:
     """Training noise: with ``probability`` a sample's keypoints (..., 3) move by up to ``max_offset`` m an axis."""
     keypoints = jnp.asarray(keypoints)

@@ -1,0 +1,253 @@
+"""A demonstration as a robot recorded it -> an episode: what is checked, and which frames become samples.
+
+Everything that people get wrong when they bring their own data is refused here with its name, the observation it was
+found in and the fix: units, orders, sizes, cameras that look the other way, rotations that are none.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from data_pipelines.records import MAX_DEPTH, DataError, Episode, make_episode
+from dsvla_jax.encoding.keypoints import replay_latch
+from dsvla_jax.geometry.cameras import project
+from dsvla_jax.types import Camera
+
+# How far a rotation matrix may be from orthonormal and a quaternion from unit length.
+ROTATION_TOLERANCE = 1e-3
+QUATERNION_TOLERANCE = 1e-2
+# Metres: no arm or camera of a table-top scene is farther from the origin, so larger numbers are other units.
+MAX_COORDINATE = 20.0
+# Metres: a depth map whose middle value is above this is in other units.
+MAX_MIDDLE_DEPTH = 20.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """One demonstration of T observations; arrays of any float type. World frame, metres, xyzw quaternions.
+
+    task: the name under which demonstrations of one kind are kept together.
+    instruction: what was to be done, in words.
+    rgb: T pictures uint8 (H, W, 3), red first. depth: T maps float (H, W), planar, 0 where there is no reading. Both
+        may be any sequence, also one that reads files when asked: only frames that become samples are looked at.
+    intrinsics: (3, 3), or (T, 3, 3) of a camera that changes, for pictures of exactly this size.
+    world_from_camera: (4, 4), or (T, 4, 4) of a camera that moves: camera-to-world, z forward.
+    pose: (T, A, 7), the end-effectors. gripper_open: (T, A), 0 or 1. Of two arms the left one first.
+    keypoints: (A, K, 3), the points that each arm is to go near, in the order of the instruction; an arm with fewer
+        than K repeats its last. None where they are not known.
+    """
+
+    task: str
+    instruction: str
+    rgb: Sequence[np.ndarray]
+    depth: Sequence[np.ndarray]
+    intrinsics: np.ndarray
+    world_from_camera: np.ndarray
+    pose: np.ndarray
+    gripper_open: np.ndarray
+    keypoints: np.ndarray | None = None
+
+
+def make_demonstration(
+    recording: Recording, samples: Sequence[tuple[int, int]], seed: int, where: object = "recording"
+) -> Episode:
+    """The episode of a recording.
+
+    Args:
+        samples: (observation to look at, observation to go to) each, ascending; see ``rlbench.keyframes``.
+        seed: the demonstration's number, kept in the episode.
+        where: names the recording in errors.
+
+    Raises:
+        DataError: anything that the module's head names, or no samples.
+    """
+    check_recording(recording, where)
+    if not samples:
+        raise DataError(where, "samples", "at least one key pose to go to", "none", "record until the task is done")
+    starts, targets = (np.array(column) for column in zip(*samples, strict=True))
+    count = len(recording.pose)
+    intrinsics, cameras = (
+        _per_observation(recording.intrinsics, count),
+        _per_observation(recording.world_from_camera, count),
+    )
+    rgb = [np.asarray(recording.rgb[start]) for start in starts]
+    depth = [np.asarray(recording.depth[start]) for start in starts]
+    for start, picture, distances in zip(starts, rgb, depth, strict=True):
+        place = f"{where}, observation {start}"
+        check_pictures(picture, distances, place)
+        check_camera(intrinsics[start], cameras[start], picture.shape[:2], place)
+    keypoints, active = _active_keypoints(recording)
+    check_keypoints(keypoints, intrinsics[starts[0]], cameras[starts[0]], where)
+    pose = np.array(recording.pose, np.float64)
+    pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+    return make_episode(
+        task=recording.task,
+        instruction=recording.instruction,
+        seed=seed,
+        rgb=rgb,
+        depth=depth,
+        intrinsics=intrinsics[starts],
+        world_from_camera=cameras[starts],
+        pose=pose[starts],
+        gripper_open=recording.gripper_open[starts],
+        target_pose=pose[targets],
+        target_gripper=recording.gripper_open[targets],
+        keypoints=keypoints,
+        active_keypoint=active[starts],
+    )
+
+
+def check_recording(recording: Recording, where: object) -> None:
+    """Raises DataError unless texts, counts, poses and grippers are right. Looks at no picture."""
+    for field in ("task", "instruction"):
+        if not getattr(recording, field).strip():
+            raise DataError(where, field, "words", "nothing", "say what is demonstrated")
+    if "/" in recording.task:
+        raise DataError(where, "task", "a name for files", repr(recording.task), "leave out the slash")
+    pose, gripper = np.asarray(recording.pose), np.asarray(recording.gripper_open)
+    if pose.ndim != 3 or pose.shape[1] not in (1, 2) or pose.shape[2] != 7:
+        fix = "give x y z qx qy qz qw for each of one or two arms at every observation"
+        raise DataError(where, "pose", "(T, A, 7) with A = 1 or 2", str(pose.shape), fix)
+    count, arms = pose.shape[:2]
+    if gripper.shape != (count, arms):
+        raise DataError(where, "gripper_open", f"{(count, arms)} as of pose", str(gripper.shape), "give one an arm")
+    for field in ("rgb", "depth"):
+        if len(getattr(recording, field)) != count:
+            got = f"{len(getattr(recording, field))}"
+            raise DataError(where, field, f"{count} pictures, one a pose", got, "record all streams in step")
+    for field, value, shape in (
+        ("intrinsics", recording.intrinsics, 3),
+        ("world_from_camera", recording.world_from_camera, 4),
+    ):
+        if value is None or np.shape(value) not in ((shape, shape), (count, shape, shape)):
+            got = "nothing" if value is None else str(np.shape(value))
+            expected = f"({shape}, {shape}) or ({count}, {shape}, {shape})"
+            raise DataError(where, field, expected, got, "give the camera's calibration; 3D input cannot do without")
+    check_poses(pose, where)
+    if wrong := sorted(set(gripper.ravel().tolist()) - {0.0, 1.0}):
+        fix = "say when a width counts as open: (width > 0.5 * largest).astype(float)"
+        raise DataError(where, "gripper_open", "0 (closed) or 1 (open)", f"{wrong[0]!r}", fix)
+    if recording.keypoints is not None:
+        shape = np.shape(recording.keypoints)
+        if len(shape) != 3 or shape[0] != arms or shape[1] == 0 or shape[2] != 3:
+            raise DataError(where, "keypoints", f"({arms}, K, 3) with K >= 1", str(shape), "or None where not known")
+
+
+def check_poses(pose: np.ndarray, where: object) -> None:
+    """Raises DataError unless every pose (T, A, 7) is finite, in metres, and has a unit quaternion."""
+    finite = np.isfinite(pose).all(axis=(1, 2))
+    if not finite.all():
+        place = f"{where}, observation {int(np.argmin(finite))}"
+        fix = "leave out observations without a pose, or the whole recording"
+        raise DataError(place, "pose", "finite numbers", f"{pose[np.argmin(finite)].tolist()}", fix)
+    far = np.abs(pose[..., :3]).max(axis=(1, 2))
+    if far.max() > MAX_COORDINATE:
+        place = f"{where}, observation {int(np.argmax(far))}"
+        raise DataError(
+            place, "pose", "metres from the world's origin", f"{far.max():.4g}", "divide millimetres by 1000"
+        )
+    length = np.linalg.norm(pose[..., 3:], axis=-1)
+    error = np.abs(length - 1).max(axis=1)
+    if error.max() > QUATERNION_TOLERANCE:
+        worst = int(np.argmax(error))
+        fix = "give qx qy qz qw, not Euler angles or an axis times an angle"
+        raise DataError(
+            f"{where}, observation {worst}", "pose", "a unit quaternion", f"length {length[worst].tolist()}", fix
+        )
+
+
+def check_pictures(rgb: np.ndarray, depth: np.ndarray, where: object) -> None:
+    """Raises DataError unless one observation's picture and depth map are what they have to be."""
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[-1] != 3:
+        fix = "give whole numbers from 0 to 255 and three channels" + (
+            "; multiply numbers from 0 to 1 by 255 first" if rgb.dtype.kind == "f" else ""
+        )
+        raise DataError(where, "rgb", "uint8 (H, W, 3)", f"{rgb.dtype} {rgb.shape}", fix)
+    if depth.shape != rgb.shape[:2]:
+        fix = "register depth to the colour camera: both must be seen by one camera at one size"
+        raise DataError(where, "depth", f"{rgb.shape[:2]} as of rgb", str(depth.shape), fix)
+    if depth.dtype.kind != "f":
+        fix = "divide by 1000 if these are millimetres, and give floating point"
+        raise DataError(where, "depth", "metres as floating point", f"{depth.dtype} up to {depth.max()}", fix)
+    if count := int(np.sum(~np.isfinite(depth))):
+        raise DataError(where, "depth", "finite values", f"{count} non-finite pixels", "write 0 for a missing reading")
+    readings = depth[depth != 0]
+    if not len(readings):
+        raise DataError(where, "depth", "some readings", "0 everywhere", "check that the depth stream was on")
+    if np.median(readings) > MAX_MIDDLE_DEPTH:
+        fix = "divide by 1000 if these are millimetres"
+        raise DataError(where, "depth", "metres", f"a median of {np.median(readings):.4g}", fix)
+    if depth.min() < 0 or depth.max() > MAX_DEPTH:
+        span = f"{depth.min():.4g} to {depth.max():.4g}"
+        raise DataError(where, "depth", f"0 to {MAX_DEPTH} m", span, "write 0 for what is out of the camera's range")
+
+
+def check_camera(intrinsics: np.ndarray, world_from_camera: np.ndarray, size: tuple[int, ...], where: object) -> None:
+    """Raises DataError unless (3, 3) and (4, 4) calibrate pictures of size (height, width)."""
+    if not (np.isfinite(intrinsics).all() and np.isfinite(world_from_camera).all()):
+        raise DataError(where, "camera", "finite numbers", "non-finite ones", "calibrate the camera")
+    height, width = size
+    row = intrinsics[2].tolist()
+    if row != [0, 0, 1] or intrinsics[0, 0] == 0 or intrinsics[1, 1] == 0 or intrinsics[1, 0] != 0:
+        fix = "give [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+        raise DataError(where, "intrinsics", "a pinhole camera's matrix", str(intrinsics.tolist()), fix)
+    u, v = intrinsics[0, 2], intrinsics[1, 2]
+    # A whole sensor's optical axis is near the middle of its picture; that of a crop need not be.
+    if not (0 <= u < width and 0 <= v < height):
+        fix = "scale the intrinsics with the picture: they are of another size"
+        raise DataError(where, "intrinsics", f"a centre in {width} x {height} pixels", f"({u:.1f}, {v:.1f})", fix)
+    rotation = world_from_camera[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > ROTATION_TOLERANCE:
+        fix = "columns must be of unit length and at right angles"
+        raise DataError(where, "world_from_camera", "a rotation", f"one off by {error:.2g}", fix)
+    if np.linalg.det(rotation) < 0:
+        fix = "one axis has the wrong sign, or x and y are exchanged"
+        raise DataError(where, "world_from_camera", "a rotation", "a mirror image", fix)
+    if world_from_camera[3].tolist() != [0, 0, 0, 1]:
+        fix = "give [[R, t], [0, 0, 0, 1]]; a transposed matrix has t in its last row"
+        raise DataError(where, "world_from_camera", "a last row 0 0 0 1", str(world_from_camera[3].tolist()), fix)
+    if np.abs(world_from_camera[:3, 3]).max() > MAX_COORDINATE:
+        got = f"{world_from_camera[:3, 3].tolist()}"
+        raise DataError(where, "world_from_camera", "a place in metres", got, "divide millimetres by 1000")
+
+
+def check_keypoints(
+    keypoints: np.ndarray, intrinsics: np.ndarray, world_from_camera: np.ndarray, where: object
+) -> None:
+    """Raises DataError where a keypoint of (A, K, 3) is not finite or lies behind the camera."""
+    if not np.isfinite(keypoints).all():
+        raise DataError(where, "keypoints", "finite numbers", "non-finite ones", "or None where not known")
+    _, depth = project(
+        np.asarray(keypoints, np.float32),
+        Camera(jnp.asarray(intrinsics, jnp.float32), jnp.asarray(world_from_camera, jnp.float32)),
+    )
+    if keypoints.size and np.asarray(depth).min() <= 0:
+        arm, place = np.unravel_index(int(np.argmin(depth)), depth.shape)
+        got = f"{keypoints[arm, place].tolist()}, {float(depth[arm, place]):.3f} m along the viewing direction"
+        fix = "give metres in the world frame, and world_from_camera, not its inverse"
+        raise DataError(where, f"keypoints[{arm}, {place}]", "a point before the camera", got, fix)
+
+
+def _per_observation(matrix: np.ndarray, count: int) -> np.ndarray:
+    matrix = np.asarray(matrix, np.float64)
+    return np.broadcast_to(matrix, (count, *matrix.shape[-2:]))
+
+
+_jitted_latch = jax.jit(replay_latch)
+
+
+def _active_keypoints(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints (A, K, 3) and the one each arm was heading for at every observation (T, A, 3); K may be 0."""
+    count, arms = np.shape(recording.pose)[:2]
+    if recording.keypoints is None:
+        return np.zeros((arms, 0, 3), np.float32), np.zeros((count, 0, 3), np.float32)
+    keypoints = np.asarray(recording.keypoints, np.float32)
+    positions = np.asarray(recording.pose, np.float32)[..., :3]
+    # Filled up with their last, which changes nothing, so that recordings of many lengths compile a few times only.
+    padded = np.pad(positions, ((0, -count % 64), (0, 0), (0, 0)), "edge")
+    points = np.pad(keypoints, ((0, 0), (0, -keypoints.shape[1] % 4), (0, 0)), "edge")
+    return keypoints, np.asarray(_jitted_latch(padded, points))[:count]

@@ -1,0 +1,1 @@
+"""Demonstrations of RLBench and its forks for PerAct and PerAct2, imported without RLBench."""

@@ -1,0 +1,149 @@
+"""Import RLBench, PerAct or PerAct2 demonstrations: python -m data_pipelines.rlbench SRC OUT [--skip-bad]
+
+SRC is a folder of tasks as RLBench's generators write it. OUT receives episodes that train.py reads with
+--data.source episodes --data.folder OUT --data.tasks all. Interrupted, it goes on with the first missing shard.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
+from data_pipelines.recording import make_demonstration
+from data_pipelines.records import DataError, Episode
+from data_pipelines.rlbench.files import find_episodes, read_recording
+from data_pipelines.rlbench.keyframes import discover_keyframes, sample_starts
+from dsvla_jax.command_line import configure_jax, fail_with_message
+
+EPISODES_PER_SHARD = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What decides the contents of an imported folder, besides its source."""
+
+    camera: str = "front"
+    """The camera to learn from."""
+    every_n: int = 10
+    """Every how many observations a further sample starts, on the way to the next key pose; 0: key poses only."""
+    keypoints: Literal["contacts", "none"] = "contacts"
+    """RLBench records no keypoints. `contacts`: where each gripper opened or closed, and its last pose, looked up in
+    the demonstration itself; none: prompts without the keypoint constraint."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(Settings):
+    """Options of the command line."""
+
+    source: tyro.conf.Positional[Path] = dataclasses.field(kw_only=True)
+    """A folder of tasks, or of one task."""
+    out: tyro.conf.Positional[Path] = dataclasses.field(kw_only=True)
+    """The folder to write; a folder with the same options is continued."""
+    tasks: tuple[str, ...] = ()
+    """Names of tasks; all that are there if not given."""
+    episodes: int | None = None
+    """The first so many of each task; all if not given."""
+    skip_bad: bool = False
+    """Leave out damaged episodes, and list them, instead of stopping at the first."""
+
+
+def contact_keypoints(pose: np.ndarray, gripper_open: np.ndarray) -> np.ndarray:
+    """Where each arm's gripper changed, in time, and where it ended: (T, A, 7) and (T, A) -> (A, K, 3).
+
+    The arm with fewer repeats its last.
+    """
+    arms = range(gripper_open.shape[1])
+    changes = [np.flatnonzero(np.diff(gripper_open[:, arm])) + 1 for arm in arms]
+    longest = max(len(frames) for frames in changes) + 1
+    places = [[*frames, *[len(pose) - 1] * (longest - len(frames))] for frames in changes]
+    return np.stack([pose[places[arm], arm, :3] for arm in arms])
+
+
+def import_episode(folder: Path, task: str, number: int, settings: Settings) -> Episode:
+    """One episode folder. Raises DataError where it is damaged."""
+    recording, joint_velocities = read_recording(folder, task, settings.camera)
+    if settings.keypoints == "contacts":
+        points = contact_keypoints(recording.pose, recording.gripper_open)
+        recording = dataclasses.replace(recording, keypoints=points)
+    keyframes = discover_keyframes(recording.gripper_open, joint_velocities)
+    return make_demonstration(recording, sample_starts(keyframes, settings.every_n), number, folder)
+
+
+def import_demonstrations(
+    source: Path,
+    out: Path,
+    settings: Settings,
+    tasks: tuple[str, ...] = (),
+    episodes: int | None = None,
+    skip_bad: bool = False,
+    progress: bool = True,
+) -> list[dict[str, str]]:
+    """Writes the folder `out`; returns what was left out, as {"episode", "reason"} each.
+
+    Raises DataError for a damaged episode unless `skip_bad`; what was written before stays, and is gone on
+    with by calling again.
+    """
+    found = find_episodes(source)
+    if missing := set(tasks) - set(found):
+        raise DataError(source, "tasks", f"some of {', '.join(found)}", ", ".join(sorted(missing)), "choose others")
+    chosen = {task: folders[:episodes] for task, folders in found.items() if not tasks or task in tasks}
+    wanted = {"importer": "rlbench", **dataclasses.asdict(settings)}
+    entries = {entry["file"]: entry for entry in existing_shards(out, wanted)}
+    with tqdm(total=sum(map(len, chosen.values())), desc="import", unit="episode", disable=not progress) as bar:
+        for task, folders in chosen.items():
+            bar.set_postfix_str(task)
+            for start in range(0, len(folders), EPISODES_PER_SHARD):
+                group = folders[start : start + EPISODES_PER_SHARD]
+                name = shard_name(task, start // EPISODES_PER_SHARD)
+                sources = [str(folder.relative_to(source)) for folder in group]
+                if name in entries and entries[name]["sources"] == sources and (out / name).exists():
+                    check_shard(out, entries[name], digest=True)
+                    bar.update(len(group))
+                    continue
+                good, skipped = [], []
+                for number, folder in enumerate(group, start):
+                    try:
+                        good.append(import_episode(folder, task, number, settings))
+                    except DataError as error:
+                        if not skip_bad:
+                            raise
+                        skipped.append({"episode": str(folder), "reason": str(error)})
+                    bar.update()
+                entries[name] = write_shard(out, name, task, good, sources=sources, skipped=skipped)
+                write_index(out, [entries[key] for key in sorted(entries)], wanted)
+    return [item for entry in entries.values() for item in entry["skipped"]]
+
+
+def main(options: Options) -> None:
+    """Imports what the options ask for, and says what came of it."""
+    settings = Settings(**{field.name: getattr(options, field.name) for field in dataclasses.fields(Settings)})
+    skipped = import_demonstrations(
+        options.source, options.out, settings, options.tasks, options.episodes, options.skip_bad
+    )
+    report(options.out, skipped)
+
+
+def report(out: Path, skipped: list[dict[str, Any]]) -> None:
+    """Prints what the folder holds now and what was left out."""
+    shards = existing_shards(out, {})
+    counts: dict[str, int] = {}
+    for entry in shards:
+        counts[entry["task"]] = counts.get(entry["task"], 0) + len(entry["frames"])
+    frames = sum(sum(entry["frames"]) for entry in shards)
+    listed = ", ".join(f"{task} {count}" for task, count in counts.items())
+    print(f"{out}: {sum(counts.values())} episodes ({listed}), {frames} samples")
+    if skipped:
+        print(f"left out {len(skipped)} damaged episodes:")
+        for item in skipped:
+            print(f"  {item['reason']}")
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        parsed = tyro.cli(Options, prog="python -m data_pipelines.rlbench", description=__doc__)
+        configure_jax()
+        main(parsed)

@@ -1,0 +1,49 @@
+"""Where a run's demonstrations come from, by ``DataConfig.source``."""
+
+import os
+from pathlib import Path
+
+from data_pipelines.demos import generate_demonstrations
+from data_pipelines.episodes import EpisodeReader
+from dsvla_jax.data_config import DataConfig
+from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, split_words
+from dsvla_jax.errors import UserError
+from dsvla_jax.sim.tasks import select_tasks
+
+
+def choose_tasks(data: DataConfig) -> tuple[str, ...]:
+    """The names of the tasks that a run learns, groups spelled out."""
+    if data.source == "simulator":
+        return select_tasks(data.tasks)
+    names = tuple(name for words in data.tasks for name in words.split(",") if name)
+    return EpisodeReader(Path(data.folder), tasks=None if "all" in names else names).tasks
+
+
+def open_demonstrations(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader:
+    """The demonstrations of ``data.tasks``; those of the simulator are made first where they are missing.
+
+    Raises UserError where an instruction has words that a word-level tokenizer does not know.
+    """
+    folder, tasks, workers = Path(data.folder), choose_tasks(data), os.cpu_count() or 1
+    if data.source == "simulator":
+        settings = {"image_size": data.image_size, "seed": data.seed, "perturb": data.perturb}
+        generate_demonstrations(folder, tasks, data.episodes, workers=workers, **settings)
+        return EpisodeReader(folder, tasks=tasks, episodes=data.episodes)
+    reader = EpisodeReader(folder, tasks=tasks, episodes=data.episodes, fewer=True)
+    if (present := len(EpisodeReader(folder, tasks=tasks))) > len(reader):
+        print(f"{folder}: {len(reader)} of {present} demonstrations are used (data.episodes is {data.episodes} a task)")
+    check_words(reader, tokenizer)
+    return reader
+
+
+def check_words(reader: EpisodeReader, tokenizer: Tokenizer) -> None:
+    """Raises UserError where a word of an instruction would become <unk>."""
+    if not isinstance(tokenizer, WordTokenizer):
+        return
+    words = {word for text in reader.instructions for word in split_words(text) if not word.lstrip("-").isdigit()}
+    if unknown := sorted(words - set(tokenizer.words)):
+        some = ", ".join(map(repr, unknown[:5])) + (f" and {len(unknown) - 5} more" if len(unknown) > 5 else "")
+        raise UserError(
+            f"{reader.folder}: the vocabulary has no token for {some}; write one with `python -m "
+            f"data_pipelines.vocabulary {reader.folder} OUT`, and train with the options that it prints"
+        )

@@ -1,0 +1,446 @@
+"""RLBench, PerAct and PerAct2 demonstrations: key poses, restricted unpickling, import, and what is refused."""
+
+import io
+import os
+import pickle
+import random
+import shutil
+import subprocess
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_pipelines.episodes import EpisodeReader
+from data_pipelines.records import DataError, decode_frame
+from data_pipelines.rlbench.__main__ import Settings, contact_keypoints, import_demonstrations
+from data_pipelines.rlbench.files import find_episodes, read_recording, unpack_depth
+from data_pipelines.rlbench.keyframes import discover_keyframes, sample_starts
+from data_pipelines.rlbench.unpickle import read_pickle, to_array
+from dsvla_jax.encoding.point_cloud import cloud_from_depth
+from dsvla_jax.geometry.cameras import project
+from dsvla_jax.types import Camera
+from tests import rlbench_files as files
+
+
+def restated_keyframes(gripper, still):
+    """PerAct's rule as its authors' documentation and code word it, for lists of one arm: gripper[i], still[i]."""
+    count, frames, wait = len(gripper), [], 0
+    for i in range(count):
+        unchanged = i < count - 2 and gripper[i] == gripper[i + 1] and gripper[i] == gripper[i - 1]
+        unchanged = unchanged and gripper[i - 2] == gripper[i - 1]
+        stop = wait <= 0 and still[i] and i != count - 2 and unchanged
+        if stop:
+            wait = 4
+        else:
+            wait -= 1
+        if i == 0:
+            continue
+        if gripper[i] != gripper[i - 1] or i == count - 1 or stop:
+            frames.append(i)
+    if len(frames) >= 2 and frames[-2] == frames[-1] - 1:
+        frames.pop(len(frames) - 2)
+    return frames
+
+
+def keyframes(gripper, still):
+    """`discover_keyframes` for strings: o open, x closed; . still, m moving."""
+    opened = np.array([[letter == "o"] for letter in gripper], float)
+    velocity = np.array([[[0.0, -0.1] if letter == "." else [0.0, -0.1001]] for letter in still])
+    found = discover_keyframes(opened, velocity)
+    assert found == restated_keyframes(gripper, [letter == "." for letter in still])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("gripper", "still", "expected"),
+    [
+        ("oooooooooo", "mmmmmmmmmm", [9]),  # only the end
+        ("ooooxxxxxx", "mmmmmmmmmm", [4, 9]),  # the first frame in which the gripper has changed
+        ("ooooxxxxxo", "mmmmmmmmmm", [4, 9]),  # a change at the end is the end
+        ("ooooooooox", "mmmmmmmmmm", [9]),
+        ("oooooooxox", "mmmmmmmmmm", [7, 9]),  # of 8 and 9 the end stays
+        ("oooooooxxo", "mmmmmmmm..", [7, 9]),  # no stop in the last two frames
+        ("oooooooooo", "mmmm.mmmmm", [4, 9]),
+        ("oooooooooooooo", "mmm..........m", [3, 8, 13]),  # a stop, and 4 frames later at the earliest the next one
+        ("oooooooooo", "mmmmmmm.mm", [7, 9]),
+        ("oooooooooo", "mmmmmmmm.m", [9]),  # the last but one never stops
+        ("oooxxxxxxx", "mm...mmmmm", [3, 9]),  # still around a change, which is no stop
+        ("oooxxxxxxx", "mm....mmmm", [3, 5, 9]),  # still from 2 on, but a stop only once the gripper rests
+        ("oo", "..", [1]),
+        ("ooo", "...", [2]),
+        ("o", ".", []),
+    ],
+)
+def test_key_poses_are_peracts(gripper, still, expected):
+    assert keyframes(gripper, still) == expected
+
+
+def test_looking_back_from_the_start_wraps_to_the_end():
+    # The gripper ends as it starts, so frame 0 is a stop by what frames -1 and -2 hold, and uses the buffer up.
+    assert keyframes("oooooooooo", "....mmmmmm") == [9]
+    assert keyframes("oooooooooo", "......mmmm") == [5, 9]
+    # It ends in another state: no stop at 0 and 1, so 2 is one.
+    assert keyframes("oooooooxxx", "....mmmmmm") == [2, 7, 9]
+    # Only the last but one differs: frame 0 looks at it, frame 1 does not.
+    assert keyframes("oooooooxxo", "....mmmmmm") == [1, 7, 9]
+
+
+def test_key_poses_of_random_demonstrations_are_peracts():
+    rng = random.Random(0)
+    for _ in range(500):
+        count = rng.randint(1, 40)
+        gripper, still = [rng.choice("oox")], [rng.choice(".m")]
+        for _ in range(count - 1):
+            gripper.append(rng.choice(gripper[-1] * 9 + "ox"))
+            still.append(rng.choice(still[-1] * 4 + ".m"))
+        keyframes("".join(gripper), "".join(still))
+
+
+def test_two_arms_stop_together_and_change_alone():
+    gripper = np.ones((20, 2))
+    gripper[12:, 1] = 0
+    velocity = np.ones((20, 2, 7))
+    velocity[3:6, 0] = 0  # one arm waits
+    velocity[8, :] = 0  # both do
+    assert discover_keyframes(gripper, velocity) == [8, 12, 19]
+
+
+def test_samples_start_at_key_poses_and_every_nth_frame():
+    assert sample_starts([7, 12, 25], 0) == [(0, 7), (7, 12), (12, 25)]
+    assert sample_starts([7, 12, 25], 10) == [(0, 7), (7, 12), (10, 12), (12, 25), (20, 25)]
+    assert sample_starts([], 10) == []
+
+
+class Loud:
+    """Leaves a file behind when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def global_payload(module, name, path):
+    """A pickle that calls module.name(path), in the plain text protocol."""
+    return f"c{module}\n{name}\n(V{path}\ntR.".encode()
+
+
+def test_nothing_in_a_pickle_is_run(tmp_path):
+    victim = tmp_path / "made"
+    payloads = {
+        "reduce": pickle.dumps(Loud(victim)),
+        "nested": pickle.dumps({"_observations": [1, {"misc": Loud(victim)}]}),
+        "posix": global_payload("posix", "mkdir", victim),
+        "builtins": global_payload("builtins", "eval", f"__import__('os').mkdir('{victim}')"),
+        "numpy": global_payload("numpy.testing._private.utils", "runstring", victim),
+        "dotted": b"\x80\x04\x8c\x05numpy\x8c\x11ndarray.__class__\x93.",
+        "codecs": global_payload("_codecs", "lookup", victim),
+        "rlbench": global_payload("rlbench.backend.utils", "image_to_float_array", victim),
+        "process": pickle.dumps(subprocess.Popen),
+    }
+    path = tmp_path / "low_dim_obs.pkl"
+    for data in payloads.values():
+        path.write_bytes(data)
+        with pytest.raises(DataError, match=r"low_dim_obs.pkl: pickle: expected only .*nothing in it was run"):
+            read_pickle(path)
+        assert not victim.exists()
+    # The payloads are real: pickle itself runs them.
+    pickle.loads(payloads["reduce"])
+    assert victim.exists()
+
+
+def test_known_names_stay_inert(tmp_path):
+    # `encode` is known, but what it is called with is only kept.
+    path = tmp_path / "x.pkl"
+    path.write_bytes(b"c_codecs\nencode\n(Vtext\nVno such encoding\ntR.")
+    assert read_pickle(path).args == ("text", "no such encoding")
+    path.write_bytes(pickle.dumps(np.array([{"a": 1}, None], object)))
+    with pytest.raises(ValueError, match="an array of"):
+        to_array(read_pickle(path))
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+def test_arrays_come_back(tmp_path, protocol):
+    values = [
+        np.arange(6, dtype=np.float32).reshape(2, 3),
+        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        np.arange(4, dtype=">i4"),
+        np.array([]),
+        np.array(1.5),
+        np.float64(2.5),
+        np.int64(-7),
+        np.bool_(True),
+        np.array([True, False]),
+    ]
+    path = tmp_path / "x.pkl"
+    path.write_bytes(pickle.dumps(values, protocol))
+    for read, value in zip(read_pickle(path), values, strict=True):
+        np.testing.assert_array_equal(to_array(read), value)
+        assert to_array(read).shape == np.shape(value)
+
+
+def test_damaged_pickles_are_refused_and_named(tmp_path):
+    files.write_episode(tmp_path, frames=5, size=8)
+    path = tmp_path / "low_dim_obs.pkl"
+    whole = path.read_bytes()
+    rng = random.Random(0)
+    damaged = [whole[: rng.randrange(len(whole))] for _ in range(50)]
+    for _ in range(400):
+        changed = bytearray(whole)
+        for _ in range(3):
+            changed[rng.randrange(len(whole))] = rng.randrange(256)
+        damaged.append(bytes(changed))
+    refused = []
+    for data in damaged:
+        path.write_bytes(data)
+        try:
+            read_recording(tmp_path, "lamp_on")
+        except DataError as error:
+            refused.append(str(error))
+    assert len(refused) > 50  # all the short ones, and changes of structure
+    assert all("low_dim_obs.pkl" in message for message in refused)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    return files.write_dataset(tmp_path_factory.mktemp("rlbench"), ["lamp_on", "bimanual_lift_ball"], size=48)
+
+
+@pytest.fixture(scope="module")
+def imported(source, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    assert import_demonstrations(source, out, Settings(), progress=False) == []
+    return EpisodeReader(out, verify="sha256")
+
+
+def test_import_keeps_poses_grippers_and_words(imported):
+    assert imported.num_arms == {"bimanual_lift_ball": 2, "lamp_on": 1}
+    assert len(imported) == 4
+    for number in range(4):
+        episode = imported.episode(number)
+        pose, gripper, velocity = files.trajectory(arms=episode.num_arms)
+        samples = sample_starts(discover_keyframes(gripper, velocity), 10)
+        assert [target for _, target in samples] == [16, 16, 22, 22, 32, 32, 39]
+        starts, targets = map(list, zip(*samples, strict=True))
+        np.testing.assert_allclose(episode.pose, pose[starts], atol=1e-6)
+        np.testing.assert_allclose(episode.target_pose, pose[targets], atol=1e-6)
+        np.testing.assert_array_equal(episode.gripper_open, gripper[starts])
+        np.testing.assert_array_equal(episode.target_gripper, gripper[targets])
+        assert episode.instruction == "pick up the red box"
+        # Each arm closes at 16, opens at 32 and ends at 39; which of them is next depends on where it has been.
+        np.testing.assert_allclose(episode.keypoints, pose[[16, 32, 39]].swapaxes(0, 1)[..., :3], atol=1e-6)
+        np.testing.assert_allclose(episode.active_keypoint[0], pose[16, :, :3], atol=1e-6)
+        np.testing.assert_allclose(episode.active_keypoint[-1], pose[39, :, :3], atol=1e-6)
+
+
+def test_arms_keep_their_sides(imported):
+    episode = imported.episode(0)
+    np.testing.assert_allclose(episode.pose[0, :, 1], [-0.05, 0.05], atol=1e-6)  # as written: left, right
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_clouds_line_up_with_their_pictures(imported, number):
+    frame = decode_frame(imported.episode(number), 1)
+    camera = Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
+    points, valid = cloud_from_depth(frame["depth"], camera, (-1.0, -1.0, 0.5), (1.0, 1.0, 2.0))
+    points, valid = np.asarray(points), np.asarray(valid)
+    assert valid.mean() > 0.5
+    pixels = np.asarray(project(points, camera)[0])
+    rows, columns = np.divmod(np.arange(len(points)), frame["rgb"].shape[1])
+    assert np.abs(pixels - np.stack([columns, rows], -1))[valid].max() < 0.01
+    # What a point's place in the world says its colour is, is the colour of its pixel. Steps of colour are 2 mm and
+    # depth is kept to 0.1 mm, so a point near a step may show the neighbouring one; a pixel is 30 mm.
+    shown = frame["rgb"].reshape(-1, 3).astype(int)
+    step = (files.colour_of(points).astype(int) - shown + 128) % 256 - 128
+    assert np.abs(step[valid]).max() <= 1
+    assert (step[valid] == 0).mean() > 0.9
+    # The table is where it was drawn.
+    on_table = valid & (points[:, 2] < files.TABLE + 0.002)
+    assert on_table.sum() > 1000
+    np.testing.assert_allclose(points[on_table, 2], files.TABLE, atol=2e-4)
+
+
+def test_depth_is_24_bits_between_near_and_far():
+    picture = np.array([[[0, 0, 0], [0, 0, 1], [255, 255, 255], [128, 0, 0]]], np.uint8)
+    depth = unpack_depth(picture, 0.0, 1.0)
+    np.testing.assert_allclose(depth, [[0, 1 / 16777215, 1, 8388608 / 16777215]], rtol=1e-12)
+    np.testing.assert_allclose(unpack_depth(picture, 0.01, 4.5)[0, [0, 2]], [0.01, 4.5])
+
+
+def test_variation_folders_and_splits(source, tmp_path):
+    by_variation = tmp_path / "upstream" / "lamp_on" / "variation7"
+    files.write_episode(by_variation / "episodes" / "episode0", frames=8, size=8)
+    files.write_episode(by_variation / "episodes" / "episode10", frames=8, size=8)
+    files.write_episode(by_variation / "episodes" / "episode2", frames=8, size=8)
+    for folder in (by_variation / "episodes").iterdir():
+        (folder / "variation_descriptions.pkl").rename(by_variation / "variation_descriptions.pkl")
+        (folder / "variation_number.pkl").unlink()
+    found = find_episodes(tmp_path / "upstream")
+    assert [path.name for path in found["lamp_on"]] == ["episode0", "episode2", "episode10"]
+    assert list(find_episodes(tmp_path / "upstream" / "lamp_on")) == ["lamp_on"]
+    assert read_recording(found["lamp_on"][0], "lamp_on")[0].instruction == "pick up the red box"
+
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root" / "train").symlink_to(source, target_is_directory=True)
+    assert sorted(find_episodes(tmp_path / "root")) == ["bimanual_lift_ball", "lamp_on"]
+    (tmp_path / "root" / "test").symlink_to(source, target_is_directory=True)
+    with pytest.raises(DataError, match=r"expected tasks, or one split, got test, train; import each by itself"):
+        find_episodes(tmp_path / "root")
+    with pytest.raises(DataError, match=r"expected TASK/all_variations"):
+        find_episodes(tmp_path / "nowhere")
+
+
+def set_value(number, **changes):
+    """A `change` of `files.write_episode` for one observation, of the arm's or of the other fields."""
+
+    def change(i, felt, rest):
+        if i == number:
+            for name, value in changes.items():
+                (rest["misc"] if name.startswith("front") else felt[-1])[name] = value
+
+    return change
+
+
+def truncate(name, share=0.6):
+    def damage(folder):
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: int(share * len(data))])
+
+    return damage
+
+
+def flip_a_bit(name):
+    def damage(folder):
+        data = bytearray((folder / name).read_bytes())
+        data[len(data) // 2] ^= 1
+        (folder / name).write_bytes(bytes(data))
+
+    return damage
+
+
+def rewrite(name, value):
+    return lambda folder: files.save_pickle(folder / name, value)
+
+
+def resize(name):
+    return lambda folder: files.save_png(folder / name, np.zeros((4, 8, 3), np.uint8))
+
+
+WRITTEN_WRONG = {
+    "nan pose": (
+        set_value(3, gripper_pose=np.array([0.2, np.nan, 1, 0, 1, 0, 0])),
+        "low_dim_obs.pkl: observation 3: gripper_pose: expected finite",
+    ),
+    "no pose": (set_value(3, gripper_pose=None), "low_dim_obs.pkl: observation 3: gripper_pose: expected numbers"),
+    "short pose": (
+        set_value(3, gripper_pose=np.zeros(6)),
+        r"observation 3: gripper_pose: expected numbers \(7,\), got \(6,\)",
+    ),
+    "zero quaternion": (
+        set_value(3, gripper_pose=np.zeros(7)),
+        "episode0, observation 3: pose: expected a unit quaternion",
+    ),
+    "nan velocity": (
+        set_value(0, joint_velocities=np.full(7, np.inf)),
+        "observation 0: joint_velocities: expected finite",
+    ),
+    "half open": (set_value(2, gripper_open=0.5), "gripper_open: expected 0 .closed. or 1 .open., got 0.5"),
+    "nan camera": (
+        set_value(1, front_camera_extrinsics=np.full((4, 4), np.nan)),
+        "observation 1: front_camera_extrinsics: expected finite",
+    ),
+    "mirrored camera": (
+        set_value(0, front_camera_extrinsics=files.CAMERA * [-1, 1, 1, 1]),
+        "observation 0: world_from_camera: expected a rotation, got a mirror",
+    ),
+    "camera of another size": (
+        set_value(0, front_camera_intrinsics=files.intrinsics(128)),
+        "observation 0: intrinsics: expected a centre in 16 x 16 pixels",
+    ),
+}
+DAMAGED = {
+    "short pickle": (truncate("low_dim_obs.pkl"), "low_dim_obs.pkl: pickle: expected a whole pickle"),
+    "foreign class": (
+        rewrite("low_dim_obs.pkl", io.BytesIO()),
+        r"low_dim_obs.pkl: pickle: expected only .*_io.BytesIO",
+    ),
+    "no pickle": (lambda folder: (folder / "low_dim_obs.pkl").unlink(), "low_dim_obs.pkl: file: .*No such file"),
+    "no demo": (rewrite("low_dim_obs.pkl", 3), "low_dim_obs.pkl: pickle: expected a Demo"),
+    "short picture": (truncate("front_rgb/0.png"), "front_rgb/0.png: picture: expected a whole PNG"),
+    "bad picture": (flip_a_bit("front_rgb/0.png"), "front_rgb/0.png: picture: expected the check sums"),
+    "short depth": (truncate("front_depth/0.png"), "front_depth/0.png: picture: expected a whole PNG"),
+    "empty picture": (truncate("front_depth/0.png", 0), "front_depth/0.png: picture: expected a PNG"),
+    "missing frame": (
+        lambda folder: (folder / "front_rgb/5.png").unlink(),
+        "front_rgb/5.png: file: expected a picture of each of 12",
+    ),
+    "missing depth": (
+        lambda folder: shutil.rmtree(folder / "front_depth"),
+        "front_depth: folder: expected 12 pictures, got none",
+    ),
+    "too many": (
+        lambda folder: shutil.copy(folder / "front_depth/0.png", folder / "front_depth/12.png"),
+        "front_depth: folder: expected 12 pictures, one an observation, got 13",
+    ),
+    "another size": (resize("front_depth/0.png"), r"observation 0: depth: expected \(16, 16\) as of rgb, got \(4, 8\)"),
+    "no words": (
+        rewrite("variation_descriptions.pkl", []),
+        "variation_descriptions.pkl: descriptions: expected a list of texts",
+    ),
+    "no variation": (lambda folder: (folder / "variation_number.pkl").unlink(), "variation_number.pkl: file"),
+    "odd variation": (rewrite("variation_number.pkl", "seven"), "variation_number.pkl: variation: expected a number"),
+}
+
+
+@pytest.mark.parametrize("name", [*WRITTEN_WRONG, *DAMAGED])
+def test_damaged_episodes_are_named_and_skipped_only_on_request(tmp_path, name):
+    change, damage = (WRITTEN_WRONG[name][0], None) if name in WRITTEN_WRONG else (None, DAMAGED[name][0])
+    message = {**WRITTEN_WRONG, **DAMAGED}[name][1]
+    episodes = tmp_path / "source" / "lamp_on" / "all_variations" / "episodes"
+    files.write_episode(episodes / "episode0", frames=12, size=16, change=change)
+    files.write_episode(episodes / "episode1", frames=12, size=16)
+    if damage:
+        damage(episodes / "episode0")
+    out = tmp_path / "out"
+    with pytest.raises(DataError, match=message) as caught:
+        import_demonstrations(tmp_path / "source", out, Settings(), progress=False)
+    assert "episode0" in str(caught.value)
+    skipped = import_demonstrations(tmp_path / "source", out, Settings(), skip_bad=True, progress=False)
+    assert [item["episode"] for item in skipped] == [str(episodes / "episode0")]
+    assert skipped[0]["reason"] == str(caught.value)
+    reader = EpisodeReader(out)
+    assert len(reader) == 1
+    assert reader.episode(0).seed == 1
+
+
+def test_import_goes_on_where_it_stopped(source, tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    import_demonstrations(source, whole, Settings(), progress=False)
+    import_demonstrations(source, parts, Settings(), tasks=("lamp_on",), progress=False)
+    kept = (parts / "lamp_on-00000.array_record").stat().st_mtime_ns
+    import_demonstrations(source, parts, Settings(), progress=False)
+    assert (parts / "lamp_on-00000.array_record").stat().st_mtime_ns == kept
+    for path in whole.iterdir():
+        assert path.read_bytes() == (parts / path.name).read_bytes()
+    with pytest.raises(DataError, match=r"settings.every_n: expected 5 as asked for, got 10"):
+        import_demonstrations(source, parts, Settings(every_n=5), progress=False)
+    with pytest.raises(DataError, match=r"tasks: expected some of bimanual_lift_ball, lamp_on, got lamp_off"):
+        import_demonstrations(source, parts, Settings(), tasks=("lamp_off",), progress=False)
+
+
+def test_without_keypoints(source, tmp_path):
+    import_demonstrations(source, tmp_path, Settings(keypoints="none", every_n=0), episodes=1, progress=False)
+    for number in range(2):
+        episode = EpisodeReader(tmp_path).episode(number)
+        assert episode.num_frames == 4
+        assert decode_frame(episode, 0)["keypoint"].shape == (0, 3)
+
+
+def test_contacts_are_where_grippers_change():
+    pose = np.arange(6 * 2 * 7, dtype=float).reshape(6, 2, 7)
+    gripper = np.array([[1, 1], [1, 1], [0, 1], [0, 1], [1, 1], [1, 1]], float)
+    points = contact_keypoints(pose, gripper)
+    np.testing.assert_array_equal(points[0], pose[[2, 4, 5], 0, :3])
+    np.testing.assert_array_equal(points[1], pose[[5, 5, 5], 1, :3])
