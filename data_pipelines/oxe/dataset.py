@@ -1,0 +1,110 @@
+"""A dataset of the registry, and one episode of it as a `Motion`."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from data_pipelines.oxe.motion import Arm, Column, Motion
+from data_pipelines.records import DataError
+from data_pipelines.rlds.features import RldsEpisode
+
+Encoding = Literal["end_effector", "joints", "navigation"]
+View = Literal["primary", "secondary", "wrist"]
+VIEWS: tuple[View, ...] = ("primary", "secondary", "wrist")
+
+
+@dataclasses.dataclass(frozen=True)
+class Depth:
+    """Calibrated depth beside the primary picture; keys of the observation. unit: metres a count.
+
+    intrinsics: (3, 3). camera_from_world: (4, 4), the extrinsic matrix with z forward, x right, y down.
+    """
+
+    key: str
+    unit: float
+    intrinsics: str
+    camera_from_world: str
+
+
+@dataclasses.dataclass(frozen=True)
+class OxeDataset:
+    """How one dataset tells its robot's motion.
+
+    hz: steps a second. source: where it is published. images: observation keys of the views.
+    language: path of the instruction in a step (text, or code points where `code_points`).
+    metric: positions and actions are metres and radians; False where the publisher does not say so, or they are scaled.
+    frame: of `Arm.action`. first: steps left out at the start. stride: every how many steps one is kept.
+    keep: which episodes are used. notes: traps, and how each is handled.
+    """
+
+    name: str
+    hz: float
+    source: str
+    images: dict[View, str]
+    arms: tuple[Arm, ...]
+    language: str = "language_instruction"
+    code_points: bool = False
+    encoding: Encoding = "end_effector"
+    metric: bool = True
+    frame: Literal["base", "tool"] = "base"
+    depth: Depth | None = None
+    first: int = 0
+    stride: int = 1
+    keep: Callable[[RldsEpisode], bool] | None = None
+    version: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the pose of every end-effector is told."""
+        return all(arm.pose is not None for arm in self.arms)
+
+    def steps(self, episode: RldsEpisode) -> np.ndarray:
+        """Numbers of the steps that are used, in order."""
+        return np.arange(self.first, episode.num_steps, self.stride)
+
+    def motion(self, episode: RldsEpisode) -> Motion:
+        """The standardised motion of the steps that are used.
+
+        Raises DataError naming the record where a column is missing, misshapen or not finite.
+        """
+        steps = self.steps(episode)
+        if not len(steps):
+            fix = "leave it out with --skip-bad"
+            raise DataError(episode.where, "steps", f"more than {self.first}", str(episode.num_steps), fix)
+        command = _columns(episode, [arm.gripper for arm in self.arms], "gripper")
+        assert command is not None
+        state = _columns(episode, [arm.gripper_state for arm in self.arms], "gripper state")
+        # Where it is not measured, the gripper is where it was last told to go.
+        state = np.concatenate([command[:1], command[:-1]]) if state is None else state
+        pose, action, joints = (
+            None if values is None else values[steps]
+            for values in (
+                _columns(episode, [arm.pose for arm in self.arms], "pose"),
+                _columns(episode, [arm.action for arm in self.arms], "action"),
+                _columns(episode, [arm.joints for arm in self.arms], "joints"),
+            )
+        )
+        return Motion(self._instruction(episode), pose, state[steps], action, command[steps], joints)
+
+    def _instruction(self, episode: RldsEpisode) -> str:
+        path = f"steps/{self.language}"
+        if self.code_points:
+            points = episode.column(path)[0].astype(np.uint8)
+            return bytes(points).split(b"\0")[0].decode(errors="replace").strip()
+        return episode.text(path)[0].strip()
+
+
+def _columns(episode: RldsEpisode, columns: list[Column | None], name: str) -> np.ndarray | None:
+    """float32 (T, A, ...) of one column an arm, or None where an arm has none."""
+    present = [column for column in columns if column is not None]
+    if len(present) < len(columns):
+        return None
+    values = np.stack([column(episode) for column in present], axis=1).astype(np.float32)
+    if not np.all(np.isfinite(values)):
+        step = int(np.argwhere(~np.isfinite(values))[0, 0])
+        got = f"{int(np.sum(~np.isfinite(values)))} NaN or infinite, the first at step {step}"
+        raise DataError(episode.where, name, "finite numbers", got, "leave the episode out with --skip-bad")
+    return values

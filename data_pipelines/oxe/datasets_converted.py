@@ -1,0 +1,436 @@
+"""Datasets of Open X-Embodiment that others converted to RLDS: one action vector, one state vector.
+
+Facts: the column descriptions of each dataset's page of https://www.tensorflow.org/datasets/catalog; octo's and
+openvla's ``oxe/transforms`` for what the pages leave open. Where a page's words leave open whether an action is a pose
+or a displacement, the action is left out and displacements come from reached poses.
+"""
+
+import numpy as np
+
+from data_pipelines.oxe.dataset import Depth, OxeDataset, View
+from data_pipelines.oxe.motion import (
+    FRANKA_WIDTH,
+    Arm,
+    Column,
+    RotationKind,
+    constant,
+    delta,
+    following,
+    join,
+    openness,
+    pose,
+    read,
+)
+from data_pipelines.rlds.features import RldsEpisode
+
+BUCKET = "gs://gresearch/robotics"
+_SUFFIX = "_converted_externally_to_rlds"
+_SCALED = "actions are scaled to -1..1: only reached poses are metric"
+_UNCLEAR = "whether the action is a pose or a displacement is unclear: displacements come from reached poses"
+_WRIST: dict[View, str] = {"primary": "image", "wrist": "wrist_image"}
+_IMAGE: dict[View, str] = {"primary": "image"}
+
+
+def _dataset(
+    name: str, hz: float, images: dict[View, str], *arms: Arm, notes: tuple[str, ...] = (), **options
+) -> OxeDataset:
+    source = f"{BUCKET}/{name}/0.1.0"
+    return OxeDataset(name, hz, source, images, arms, notes=notes, **options)
+
+
+def _closing(stop: int) -> Column:
+    """A command of -1 for open and +1 for closed in the column before `stop`; 0 is on the way from 1 to -1."""
+    return openness(read("action", stop - 1, stop), 1, 0)
+
+
+def _opening(start: int) -> Column:
+    """A command of 0 for closed and 1 for open."""
+    return openness(read("action", start, start + 1), 0, 1)
+
+
+def _state_matrix(name: str, hz: float, **options) -> OxeDataset:
+    """7 joints, the gripper's width and the hand's 4 x 4 pose as state (VIOLA's and LIBERO's robot stack)."""
+    arm = Arm(
+        gripper=_closing(7),
+        pose=pose(read("observation/state", 8, 24), "matrix"),
+        action=delta(read("action", 0, 6), "rpy"),
+        gripper_state=openness(read("observation/state", 7, 8), 0, FRANKA_WIDTH),
+    )
+    notes = ("the state's last 16 columns are the hand's pose, which octo and openvla leave unread", _SCALED)
+    return _dataset(name, hz, _WRIST, arm, notes=notes, **options)
+
+
+def _reached(
+    name: str,
+    hz: float,
+    rotation: RotationKind,
+    gripper_state: Column | None = None,
+    images: dict[View, str] | None = None,
+    gripper: Column | None = None,
+    state: str = "observation/state",
+    notes: tuple[str, ...] = (),
+    **options,
+) -> OxeDataset:
+    """Poses in the first six columns of the state; the command's pose columns are left out."""
+    gripper = _opening(6) if gripper is None else gripper
+    arm = Arm(gripper=gripper, pose=pose(read(state, 0, 6), rotation), gripper_state=gripper_state)
+    return _dataset(name, hz, images or _IMAGE, arm, notes=(_UNCLEAR, *notes), **options)
+
+
+def _velocity_gripper(episode: RldsEpisode) -> np.ndarray:
+    return openness(read("observation/state", 6, 7), 0, FRANKA_WIDTH)(episode)
+
+
+DATASETS = [
+    _dataset(
+        f"stanford_kuka_multimodal_dataset{_SUFFIX}",
+        20,
+        _IMAGE,
+        Arm(
+            gripper=_opening(3),
+            pose=pose(join(read("observation/ee_position"), read("observation/ee_orientation")), "xyzw"),
+            action=delta(read("action", 0, 3), "none"),
+        ),
+        notes=("the peg is held throughout", "depth comes without a camera"),
+    ),
+    _dataset(
+        f"nyu_rot_dataset{_SUFFIX}",
+        3,
+        _IMAGE,
+        Arm(
+            gripper=openness(read("action", 6, 7), 1, 0),
+            pose=pose(read("observation/state", 0, 6), "rpy"),
+            action=delta(read("action", 0, 6), "rpy"),
+            gripper_state=openness(read("observation/state", 6, 7), 1, 0),
+        ),
+        notes=("0 is open and 1 closed, in state and action: octo and openvla keep it the wrong way round",),
+    ),
+    _dataset(
+        f"stanford_hydra_dataset{_SUFFIX}",
+        10,
+        _WRIST,
+        Arm(
+            gripper=openness(read("action", 6, 7), 1, 0),
+            pose=pose(join(read("observation/state", 0, 3), read("observation/state", 7, 10)), "rpy"),
+            action=delta(read("action", 0, 6), "rpy"),
+        ),
+        notes=("which of three gripper columns is the opening is not told: the last command stands for it",),
+    ),
+    _state_matrix(f"austin_buds_dataset{_SUFFIX}", 20),
+    _state_matrix("utaustin_mutex", 20),
+    _dataset(
+        f"nyu_franka_play_dataset{_SUFFIX}",
+        3,
+        {"primary": "image", "secondary": "image_additional_view"},
+        Arm(
+            gripper=_opening(13),
+            pose=pose(read("observation/state", 7, 13), "rpy"),
+            action=delta(read("action", 7, 13), "rpy"),
+        ),
+        notes=("the action starts with 7 joint velocities and ends with a flag", "depth comes without a camera"),
+    ),
+    _dataset(
+        f"maniskill_dataset{_SUFFIX}",
+        20,
+        _WRIST,
+        Arm(
+            gripper=openness(read("action", 6, 7), -1, 1),
+            pose=pose(read("observation/tcp_pose"), "wxyz"),
+            action=delta(read("action", 0, 6), "rotvec", 0.1, 0.1),
+            gripper_state=openness(read("observation/state", 7, 8), 0, FRANKA_WIDTH / 2),
+        ),
+        depth=Depth("depth", 2.0**-10, "main_camera_intrinsic_cv", "main_camera_extrinsic_cv"),
+        notes=(
+            "the gripper's -1 (closed) to 1 (open) becomes 0 to 1; octo and openvla leave it",
+            "rotations are axis-angle, not roll-pitch-yaw; a unit of action is 0.1 m or 0.1 rad",
+            "quaternions have their real part first; poses are in the simulator's world frame",
+            "calibrated depth: the one dataset that can feed the 3D path",
+        ),
+    ),
+    _dataset(
+        f"furniture_bench_dataset{_SUFFIX}",
+        10,
+        _WRIST,
+        Arm(
+            gripper=_closing(8),
+            pose=pose(read("observation/state", 0, 7), "xyzw"),
+            action=delta(read("action", 0, 7), "xyzw"),
+            gripper_state=openness(read("observation/state", 34, 35), 0, FRANKA_WIDTH),
+        ),
+        notes=("the action's rotation is a quaternion",),
+    ),
+    _dataset(
+        f"cmu_franka_exploration_dataset{_SUFFIX}",
+        10,
+        {"primary": "highres_image"},
+        Arm(gripper=_opening(6), action=delta(read("action", 0, 6), "rpy")),
+        metric=False,
+        notes=("no robot state; the units of actions are not told", "the last column is a flag"),
+    ),
+    _dataset(
+        f"ucsd_kitchen_dataset{_SUFFIX}",
+        2,
+        _IMAGE,
+        Arm(gripper=_opening(6), pose=pose(read("action", 0, 6), "rpy", 1e-3, np.pi / 180)),
+        notes=(
+            "the action is a pose in millimetres and degrees (openvla's published statistics: mean x 410): it stands"
+            " for the pose, since the state is joints only",
+        ),
+    ),
+    _dataset(
+        f"ucsd_pick_and_place_dataset{_SUFFIX}",
+        3,
+        _IMAGE,
+        Arm(
+            gripper=_opening(3),
+            pose=pose(read("observation/state", 0, 6), "rpy"),
+            action=delta(read("action", 0, 3), "none", 1 / 3),
+        ),
+        notes=("actions are velocities of the hand, which never turns: divided by the frequency",),
+    ),
+    _dataset(
+        f"austin_sailor_dataset{_SUFFIX}",
+        20,
+        _WRIST,
+        Arm(
+            gripper=_closing(7),
+            pose=pose(read("observation/state", 0, 7), "xyzw"),
+            action=delta(read("action", 0, 6), "rpy"),
+            gripper_state=openness(read("observation/state_gripper"), 0, 0.077),
+        ),
+        notes=(_SCALED,),
+    ),
+    _dataset(
+        f"austin_sirius_dataset{_SUFFIX}",
+        20,
+        _WRIST,
+        Arm(
+            gripper=_closing(7),
+            pose=pose(read("observation/state_ee"), "matrix"),
+            action=delta(read("action", 0, 6), "rpy"),
+            gripper_state=openness(read("observation/state_gripper"), 0, 0.077),
+        ),
+        notes=("`state` is joints, which octo and openvla take for a pose: state_ee is the pose", _SCALED),
+    ),
+    _reached(f"utokyo_pr2_opening_fridge{_SUFFIX}", 10, "rpy"),
+    _reached(f"utokyo_pr2_tabletop_manipulation{_SUFFIX}", 10, "rpy"),
+    _reached(
+        f"utokyo_xarm_pick_and_place{_SUFFIX}",
+        10,
+        "ypr",
+        images={"primary": "image", "secondary": "image2", "wrist": "hand_image"},
+        state="observation/end_effector_pose",
+        notes=("angles come as yaw, pitch, roll",),
+    ),
+    _dataset(
+        f"utokyo_xarm_bimanual{_SUFFIX}",
+        10,
+        _IMAGE,
+        Arm(gripper=_opening(6), pose=pose(read("observation/pose_l"), "ypr")),
+        Arm(gripper=_opening(13), pose=pose(read("observation/pose_r"), "ypr")),
+        notes=(
+            _UNCLEAR,
+            "two arms, left first: octo and openvla throw the left one away",
+            "angles come as yaw, pitch, roll",
+        ),
+    ),
+    _dataset(
+        "robo_net",
+        1,
+        {"primary": "image", "secondary": "image1"},
+        Arm(
+            gripper=_opening(4),
+            pose=pose(read("observation/state", 0, 4), "yaw"),
+            action=delta(read("action", 0, 4), "yaw"),
+            gripper_state=openness(read("observation/state", 4, 5), 0, 1),
+        ),
+        metric=False,
+        notes=(
+            "the fourth column is yaw; octo and openvla put it where roll belongs",
+            "states are scaled to each robot's workspace",
+        ),
+    ),
+    _dataset(
+        f"berkeley_mvp{_SUFFIX}",
+        5,
+        {"wrist": "hand_image"},
+        Arm(
+            gripper=openness(read("action", 7, 8), 1, 0),
+            pose=pose(read("observation/pose"), "xyzw"),
+            gripper_state=openness(read("observation/gripper"), 1, 0),
+        ),
+        notes=("actions are joints: displacements come from reached poses", "wrist camera only"),
+    ),
+    _dataset(
+        f"berkeley_rpt{_SUFFIX}",
+        30,
+        {"wrist": "hand_image"},
+        Arm(
+            gripper=openness(read("action", 7, 8), 1, 0),
+            joints=read("observation/joint_pos"),
+            gripper_state=openness(read("observation/gripper"), 1, 0),
+        ),
+        encoding="joints",
+        stride=3,
+        notes=(
+            "joints only, no pose of the hand",
+            "30 Hz: every third step is kept, as octo does",
+            "wrist camera only",
+        ),
+    ),
+    _dataset(
+        f"kaist_nonprehensile{_SUFFIX}",
+        10,
+        _IMAGE,
+        Arm(
+            gripper=constant(0.0),
+            pose=pose(read("observation/state", 14, 21), "xyzw"),
+            action=delta(read("action", 0, 6), "rotvec"),
+        ),
+        notes=("rotations are axis-angle; 14 columns of gains follow", "it pushes with a closed gripper"),
+    ),
+    _dataset(
+        f"stanford_mask_vit{_SUFFIX}",
+        1,
+        _IMAGE,
+        Arm(
+            gripper=openness(read("action", 4, 5), 1, -1),
+            pose=pose(read("observation/end_effector_pose", 0, 4), "yaw"),
+            action=delta(read("action", 0, 4), "yaw"),
+        ),
+        metric=False,
+        notes=(
+            "the fourth column is yaw; octo and openvla put it where roll belongs",
+            "-1 opens and 1 closes: octo and openvla keep it the wrong way round",
+        ),
+    ),
+    _reached(f"tokyo_u_lsmo{_SUFFIX}", 10, "rpy"),
+    _reached(
+        f"dlr_sara_pour{_SUFFIX}",
+        10,
+        "zxy",
+        notes=("angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",),
+    ),
+    _reached(
+        f"dlr_sara_grid_clamp{_SUFFIX}",
+        10,
+        "zxy",
+        notes=("angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",),
+    ),
+    _reached(
+        f"dlr_edan_shared_control{_SUFFIX}",
+        5,
+        "zxy",
+        gripper=openness(read("action", 6, 7), 1, 0),
+        gripper_state=openness(read("observation/state", 6, 7), 1, 0),
+        notes=("angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",),
+    ),
+    _reached(
+        f"asu_table_top{_SUFFIX}",
+        12.5,
+        "rpy",
+        gripper_state=openness(read("observation/state", 6, 7), 0, 1),
+        state="ground_truth_states/EE",
+        notes=("the page calls the action joint velocities",),
+    ),
+    _dataset(
+        f"stanford_robocook{_SUFFIX}",
+        5,
+        {"primary": "image_1", "secondary": "image_2"},
+        Arm(
+            gripper=following(_velocity_gripper),
+            pose=pose(read("observation/state", 0, 6), "rpy"),
+            action=delta(read("action", 0, 6), "rotvec", 1 / 5, 1 / 5),
+            gripper_state=_velocity_gripper,
+        ),
+        notes=(
+            "actions are velocities: divided by the frequency",
+            "the gripper's action is a velocity too: the opening of the next step is the command",
+            "depth and extrinsics come without intrinsics",
+        ),
+    ),
+    _dataset(
+        "imperialcollege_sawyer_wrist_cam",
+        10,
+        _WRIST,
+        Arm(
+            gripper=_opening(6),
+            action=delta(read("action", 0, 6), "ypr"),
+            gripper_state=openness(read("observation/state"), 0, 1),
+        ),
+        frame="tool",
+        notes=(
+            "displacements are in the frame of the tool, angles as yaw, pitch, roll",
+            "both cameras are the wrist's",
+        ),
+    ),
+    _dataset(
+        f"iamlab_cmu_pickup_insert{_SUFFIX}",
+        20,
+        _WRIST,
+        Arm(
+            gripper=_opening(7),
+            pose=pose(read("action", 0, 7), "xyzw"),
+            gripper_state=openness(read("observation/state", 7, 8), 0, 1),
+        ),
+        notes=("the action is a pose: it stands for the pose, since the state is joints only",),
+    ),
+    _dataset(
+        "uiuc_d3field",
+        1,
+        {"primary": "image_1", "secondary": "image_2"},
+        Arm(
+            gripper=constant(0.0),
+            pose=pose(read("observation/state"), "matrix"),
+            action=delta(read("action"), "none"),
+        ),
+        notes=("octo and openvla report the data broken", "no gripper is told: always closed"),
+    ),
+    _dataset(
+        "berkeley_fanuc_manipulation",
+        10,
+        _WRIST,
+        Arm(
+            gripper=following(openness(read("observation/state", 6, 7), 1, 0)),
+            pose=pose(read("observation/end_effector_state"), "xyzw"),
+            action=delta(read("action"), "rpy"),
+            gripper_state=openness(read("observation/state", 6, 7), 1, 0),
+        ),
+        notes=(
+            "no gripper action: the next state stands for it, 1 being closed as octo and openvla have it",
+            "end_effector_state is the pose, which octo and openvla leave unread",
+        ),
+    ),
+    _dataset(
+        "cmu_playing_with_food",
+        10,
+        {"primary": "image", "wrist": "finger_vision_1"},
+        Arm(gripper=openness(read("action", -1), 0, 1), action=delta(read("action", 0, 7), "xyzw")),
+        metric=False,
+        notes=("the action's rotation is a quaternion", "the layout of its state is not published"),
+    ),
+    _dataset(
+        "cmu_play_fusion",
+        5,
+        _IMAGE,
+        Arm(
+            gripper=_opening(7),
+            action=delta(read("action", 0, 7), "xyzw"),
+            gripper_state=openness(read("observation/state", 7, 8), 0, 1),
+        ),
+        metric=False,
+        notes=("the rotation is a quaternion; octo and openvla take its tail, the gripper and a flag for rotation",),
+    ),
+    _dataset(
+        "cmu_stretch",
+        10,
+        _IMAGE,
+        Arm(
+            gripper=_opening(6),
+            pose=pose(read("observation/state", 0, 3), "none"),
+            action=delta(read("action", 0, 6), "rpy"),
+            gripper_state=openness(read("observation/state", 3, 4), 0, 1),
+        ),
+        notes=("the state has no rotation",),
+    ),
+]

@@ -1,0 +1,213 @@
+"""What every dataset is brought to: `Motion`, and the small vocabulary in which the registry says how.
+
+Standard: positions in metres, rotations as unit quaternions xyzw or rotation vectors in radians, grippers 1 for open
+and 0 for closed, two arms left first. A displacement is what is added to a position and multiplied from the left to a
+rotation (``frame="base"``), or the same seen from the tool (``frame="tool"``).
+
+Axes: T steps of an episode, A arms, J joints.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from data_pipelines.records import DataError
+from data_pipelines.rlds.features import RldsEpisode
+
+RotationKind = Literal["rpy", "ypr", "zxy", "xyzw", "wxyz", "rotvec", "matrix", "yaw", "none"]
+Column = Callable[[RldsEpisode], np.ndarray]
+"""(T, n) of an episode."""
+
+FRANKA_WIDTH = 0.08
+"""Metres between the fingers of an open Franka hand."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """One episode as the policy sees it, without its pictures. float32.
+
+    pose: (T, A, 7), or None where the data do not tell it.
+    gripper_open: (T, A), as measured, or else as last commanded.
+    action: (T, A, 6), commanded displacement of each step, translation and rotation vector; or None.
+    gripper_command: (T, A). joints: (T, A, J) for datasets that tell joints only, else None.
+    """
+
+    instruction: str
+    pose: np.ndarray | None
+    gripper_open: np.ndarray
+    action: np.ndarray | None
+    gripper_command: np.ndarray
+    joints: np.ndarray | None = None
+
+    @property
+    def num_steps(self) -> int:
+        return len(self.gripper_command)
+
+    @property
+    def num_arms(self) -> int:
+        return self.gripper_command.shape[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """Where one arm's motion stands in an episode.
+
+    pose: (T, 7). action: (T, 6). gripper: (T,), commanded openness. gripper_state: (T,), measured openness.
+    joints: (T, J).
+    """
+
+    gripper: Column
+    pose: Column | None = None
+    action: Column | None = None
+    gripper_state: Column | None = None
+    joints: Column | None = None
+
+
+def read(path: str, start: int | None = None, stop: int | None = None) -> Column:
+    """Columns start to stop of a feature of the steps, float64 (T, n)."""
+
+    def column(episode: RldsEpisode) -> np.ndarray:
+        values = episode.column(f"steps/{path}").astype(np.float64)
+        return values.reshape(len(values), -1)[:, start:stop]
+
+    return column
+
+
+def join(*columns: Column) -> Column:
+    """Columns side by side."""
+    return lambda episode: np.concatenate([column(episode) for column in columns], axis=1)
+
+
+def pose(column: Column, rotation: RotationKind, scale: float = 1.0, turn: float = 1.0) -> Column:
+    """Position (3, or fewer where the rest is zero) and then rotation as (T, 7); scale: metres a unit; turn: radians.
+
+    "matrix" takes a flattened 4 x 4 pose, by rows or by columns: whichever leaves 0 0 0 1 at the end.
+    """
+
+    def column_of(episode: RldsEpisode) -> np.ndarray:
+        values = column(episode)
+        if rotation == "matrix":
+            matrix = _pose_matrix(values.reshape(-1, 4, 4), episode)
+            position, turned = matrix[:, :3, 3], Rotation.from_matrix(matrix[:, :3, :3])
+        else:
+            size = _ROTATION_SIZE[rotation]
+            position = values[:, : values.shape[1] - size]
+            turned = as_rotation(values[:, position.shape[1] :], rotation, turn, episode.where)
+        filled = np.zeros((len(values), 3))
+        filled[:, : position.shape[1]] = position * scale
+        return np.concatenate([filled, turned.as_quat(canonical=True)], axis=1)
+
+    return column_of
+
+
+def delta(column: Column, rotation: RotationKind, scale: float = 1.0, turn: float = 1.0) -> Column:
+    """Translation (up to 3) and then rotation of a step as (T, 6). scale, turn: metres and radians a unit."""
+
+    def column_of(episode: RldsEpisode) -> np.ndarray:
+        values = column(episode)
+        size = _ROTATION_SIZE[rotation]
+        moved = np.zeros((len(values), 6))
+        moved[:, : values.shape[1] - size] = values[:, : values.shape[1] - size] * scale
+        turns = values[:, values.shape[1] - size :]
+        if rotation == "xyzw":
+            # A step without a motion may be written as four zeros.
+            turns = np.where(np.abs(turns).sum(1, keepdims=True) > 0, turns, [0.0, 0.0, 0.0, 1.0])
+        moved[:, 3:] = as_rotation(turns, rotation, turn, episode.where).as_rotvec()
+        return moved
+
+    return column_of
+
+
+def openness(column: Column, closed: float, opened: float) -> Column:
+    """(T,), the reading mapped linearly so that `closed` gives 0 and `opened` gives 1, clipped to that."""
+    return lambda episode: np.clip((column(episode)[:, 0] - closed) / (opened - closed), 0.0, 1.0)
+
+
+def constant(value: float) -> Column:
+    """(T,): a gripper that never moves, or is not told."""
+    return lambda episode: np.full(episode.num_steps, value)
+
+
+def relative_closing(column: Column) -> Column:
+    """(T,): commands to close (> 0.1), open (< -0.1) or stay; before the first one, the state that it undoes."""
+
+    def column_of(episode: RldsEpisode) -> np.ndarray:
+        values = column(episode)[:, 0]
+        command = np.where(values > 0.1, 0.0, np.where(values < -0.1, 1.0, np.nan))
+        told = np.flatnonzero(~np.isnan(command))
+        if not len(told):
+            return np.ones(len(values))
+        last = np.maximum.accumulate(np.where(np.isnan(command), -1, np.arange(len(values))))
+        return np.where(last < 0, 1.0 - command[told[0]], command[np.maximum(last, 0)])
+
+    return column_of
+
+
+def settled(column: Column) -> Column:
+    """(T,): a continuous opening as 0 or 1, a half-way reading counting as the end that the motion reaches."""
+
+    def column_of(episode: RldsEpisode) -> np.ndarray:
+        values = column(episode)[:, 0]
+        result = np.where(values > 0.95, 1.0, np.where(values < 0.05, 0.0, np.nan))
+        following = float(values[-1] > 0.5) if len(values) else 0.0
+        for place in range(len(values) - 1, -1, -1):
+            following = following if np.isnan(result[place]) else float(result[place])
+            result[place] = following
+        return result
+
+    return column_of
+
+
+def following(column: Column) -> Column:
+    """(T,): the command that a measured opening shows one step later."""
+
+    def column_of(episode: RldsEpisode) -> np.ndarray:
+        values = column(episode)
+        return np.concatenate([values[1:], values[-1:]])
+
+    return column_of
+
+
+def as_rotation(values: np.ndarray, kind: RotationKind, turn: float, where: str) -> Rotation:
+    """(T, size of the kind) as rotations. rpy: about fixed x, y, z. ypr: yaw, pitch, roll. zxy: about fixed z, x, y."""
+    match kind:
+        case "xyzw" | "wxyz":
+            values = values if kind == "xyzw" else np.roll(values, -1, axis=1)
+            if np.any(np.abs(values).sum(1) == 0):
+                raise DataError(where, "rotation", "quaternions", "four zeros", "leave the episode out with --skip-bad")
+            return Rotation.from_quat(values)
+        case "rpy":
+            return Rotation.from_euler("xyz", values * turn)
+        case "ypr":
+            return Rotation.from_euler("ZYX", values * turn)
+        case "zxy":
+            return Rotation.from_euler("zxy", values * turn)
+        case "rotvec":
+            return Rotation.from_rotvec(values * turn)
+        case "yaw":
+            return Rotation.from_euler("z", values * turn)
+        case _:
+            return Rotation.from_rotvec(np.zeros((len(values), 3)))
+
+
+_ROTATION_SIZE = {"rpy": 3, "ypr": 3, "zxy": 3, "xyzw": 4, "wxyz": 4, "rotvec": 3, "yaw": 1, "none": 0}
+
+
+def _pose_matrix(matrix: np.ndarray, episode: RldsEpisode) -> np.ndarray:
+    end = np.array([0.0, 0.0, 0.0, 1.0])
+    for candidate in (matrix, matrix.transpose(0, 2, 1)):
+        if np.allclose(candidate[:, 3], end, atol=1e-3):
+            return candidate
+    got = np.array2string(matrix[0, 3], precision=3)
+    raise DataError(episode.where, "pose", "a 4 x 4 pose ending in 0 0 0 1", got, "is this the right dataset?")
+
+
+def displacement(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """What leads from poses (..., 7) to poses (..., 7), in the base frame: (..., 6), metres and rotation vector."""
+    shape = start.shape[:-1]
+    first, last = (Rotation.from_quat(x[..., 3:].reshape(-1, 4)) for x in (start, end))
+    turned = (last * first.inv()).as_rotvec().reshape(*shape, 3)
+    return np.concatenate([end[..., :3] - start[..., :3], turned], axis=-1)
