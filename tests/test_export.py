@@ -73,8 +73,8 @@ def test_merged_folders_are_read_back_as_the_merged_towers(tmp_path, model):
     assert not language.unused
     assert not vision.unused
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)  # noqa: E731
-    jax.tree.map(close, language.params, merged["language"])
-    jax.tree.map(close, vision.params, merged["vision"])
+    jax.tree.map(close, language.load(), merged["language"])
+    jax.tree.map(close, vision.load(), merged["vision"])
     stored = load_file(tmp_path / "out" / "projector" / "model.safetensors")
     expected = {
         ".".join(str(key.key) for key in path): np.asarray(leaf)
@@ -134,13 +134,13 @@ def test_shards_keep_their_size_and_are_read_back_alike(run, tmp_path):
         total += sum(size.values())
     assert index["metadata"]["total_size"] == total
     for read, tower in ((read_language, "language"), (read_vision, "vision")):
-        assert_same(read(tmp_path / "many" / tower).params, read(tmp_path / "one" / tower).params)
+        assert_same(read(tmp_path / "many" / tower).load(), read(tmp_path / "one" / tower).load())
 
 
 def test_bfloat16_is_the_rounded_merge_and_half_the_size(run, tmp_path):
     folder, variables = run
     export(folder, tmp_path / "half", merged=True, dtype=jnp.bfloat16)
-    read = read_language(tmp_path / "half" / "language").params
+    read = read_language(tmp_path / "half" / "language").load()
     merged = merge_lora(variables, LORA)["params"]["language"]
     assert_same(read, jax.tree.map(lambda x: np.asarray(x.astype(jnp.bfloat16).astype(jnp.float32)), merged))
     export(folder, tmp_path / "full", merged=True)
@@ -161,7 +161,7 @@ def test_a_whole_model_trained_without_adapters(tmp_path):
     with pytest.raises(UserError, match="has no adapters: export its whole models with --merged"):
         export(tmp_path / "run", tmp_path / "out", model)
     export(tmp_path / "run", tmp_path / "out", model, merged=True)
-    assert_same(read_language(tmp_path / "out" / "language").params, variables["params"]["language"])
+    assert_same(read_language(tmp_path / "out" / "language").load(), variables["params"]["language"])
 
 
 def test_the_vocabulary_opens_as_tokenizers_own(run, tmp_path):

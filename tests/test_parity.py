@@ -114,7 +114,7 @@ def test_hidden_states_and_logits_of_llama(tmp_path, name):
     assert isinstance(tower.config, LanguageConfig)
     batch = padded_batch(config.vocab_size, 60 if name == "llama3" else 13)
     expected = their_language(theirs, batch)
-    actual = our_language(ModelConfig(language=tower.config), {"params": tower.params}, batch)
+    actual = our_language(ModelConfig(language=tower.config), {"params": tower.load()}, batch)
     for ours, oracle in zip(actual, expected, strict=True):
         assert_close(np.asarray(ours)[batch["mask"]], oracle[batch["mask"]])
 
@@ -126,7 +126,7 @@ def test_hidden_states_of_clip(tmp_path, name):
     tower = read_vision(tmp_path / "source")
     assert isinstance(tower.config, VisionConfig)
     image = draw_image(tower.config.image_size)
-    ours = our_vision(ModelConfig(vision=tower.config), {"params": tower.params}, image)
+    ours = our_vision(ModelConfig(vision=tower.config), {"params": tower.load()}, image)
     assert_close(ours, their_vision(theirs, image))
 
 
@@ -224,7 +224,7 @@ def test_merged_in_peft_and_by_us_is_the_same(case):
         model.save_pretrained(folder)
         projected = tower == "vision" and "projection" in merged[tower]
         read = read_language(folder) if tower == "language" else read_vision(folder, projection=projected)
-        jax.tree.map(lambda ours, theirs: assert_close(ours, theirs, 1e-5), merged[tower], read.params)
+        jax.tree.map(lambda ours, theirs: assert_close(ours, theirs, 1e-5), merged[tower], read.load())
 
 
 def open_merged(case: Case, folder: str) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -272,4 +272,4 @@ def test_through_transformers_and_back_nothing_changes(tmp_path, case):
     language.save_pretrained(tmp_path / "again")
     before, after = read_language(case.root / "merged" / "language"), read_language(tmp_path / "again")
     assert after.config == before.config
-    jax.tree.map(np.testing.assert_array_equal, after.params, before.params)
+    jax.tree.map(np.testing.assert_array_equal, after.load(), before.load())
