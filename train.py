@@ -8,11 +8,11 @@ import dataclasses
 import json
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from tensorboardX import SummaryWriter
@@ -27,12 +27,12 @@ from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.text import WordTokenizer, load_tokenizer
 from dsvla_jax.errors import UserError
-from dsvla_jax.model.variables import split_variables
+from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
-from dsvla_jax.training.sharding import batch_sharding, replicate
-from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
+from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 
 
 def main(experiment: Experiment, run: Path, resume: bool) -> None:
@@ -40,6 +40,8 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
     tokenizer = tokenizer_of(experiment)
     tasks = choose_tasks(experiment.data)
     experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
+    mesh = make_mesh(experiment.mesh)
+    part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     prepare_run_folder(run, experiment, resume)
     checkpoints = RunCheckpoints(run)
     if checkpoints.latest_step == experiment.steps:
@@ -49,19 +51,26 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
     data = experiment.data
     reader = open_demonstrations(data, tokenizer)
     sample = make_sampler(data, experiment.encoding, tokenizer)
-    loader = make_loader(reader, sample, batch_size=experiment.batch_size, seed=experiment.seed)
+    loader = make_loader(
+        reader,
+        sample,
+        batch_size=part.size,
+        seed=experiment.seed,
+        process_index=part.index,
+        process_count=part.count,
+    )
 
     model = VLA(experiment.model)
-    variables = initial_variables(experiment, tokenizer.number_values)
-    trainable, frozen = split_variables(variables, experiment.regime)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
-    report_size(trainable, frozen, reader.num_frames)
+    start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
+    state, frozen = make_sharded(start, mesh, base_params(experiment, mesh))
+    report_size(state.trainable, frozen, reader.num_frames)
 
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
         restored = checkpoints.restore(state.trainable, state.optimizer)
-        state = TrainState(jnp.asarray(restored.step, jnp.int32), restored.trainable, restored.optimizer)
+        step = jax.device_put(np.int32(restored.step), state.step.sharding)
+        state = TrainState(step, restored.trainable, restored.optimizer)
         loader.set_state(restored.iterator)
         print(f"resuming {run} at step {restored.step}")
     else:
@@ -69,13 +78,12 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
         save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model), tokenizer)
         checkpoints.save_base(frozen)
 
-    train_step = jax.jit(make_train_step(experiment, model, optimizer, tokenizer.number_values), donate_argnums=0)
-    state, frozen = replicate(state), replicate(frozen)
-    sharding = batch_sharding()
+    train_step = make_train_step(experiment, model, optimizer, tokenizer.number_values)
+    train_step = jit_train_step(train_step, state, mesh)
     first = int(state.step)
     with Metrics(run, first) as metrics, tqdm(total=experiment.steps, initial=first, unit="step", desc="train") as bar:
         for step in range(first, experiment.steps):
-            batch = jax.device_put(next(loader), sharding)
+            batch = put_batch(next(loader), mesh)
             if step == first:
                 bar.set_postfix_str("compiling the training step")
             state, step_metrics = train_step(state, frozen, batch)
@@ -103,14 +111,14 @@ def tokenizer_of(experiment: Experiment) -> WordTokenizer:
     return tokenizer
 
 
-def initial_variables(experiment: Experiment, number_values: np.ndarray) -> dict[str, Any]:
-    """The variables at step 0: random by the seed, or those of the base run with fresh adapters."""
-    variables = jax.jit(lambda: initialize(experiment.model, jax.random.key(experiment.seed), number_values))()
-    if experiment.base:
-        base = dsvla_jax.policy.load(Path(experiment.base)).variables
-        require_same_shapes(base["params"], variables["params"], Path(experiment.base))
-        variables = {**variables, "params": base["params"]}
-    return variables
+def base_params(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str, Any] | None:
+    """The parameters of the base run, split over the mesh; None where the experiment starts from random ones."""
+    if not experiment.base:
+        return None
+    params = dsvla_jax.policy.load(Path(experiment.base), mesh).variables["params"]
+    expected = jax.eval_shape(lambda: initialize(experiment.model, jax.random.key(0)))
+    require_same_shapes(params, expected["params"], Path(experiment.base))
+    return params
 
 
 def prepare_run_folder(run: Path, experiment: Experiment, resume: bool) -> None:

@@ -12,6 +12,7 @@ from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
+from dsvla_jax.training.sharding import MeshConfig
 
 EPOCHS, DEMONSTRATIONS, BATCH = 10, 100, 3
 # One demonstration of each of the 26 tasks has so many key poses together (docs/tasks.md).
@@ -39,6 +40,7 @@ def config() -> Experiment:
         regime="lora",
         base="runs/paper_7b_base",
         tokenizer="tokenizers/llama",
+        mesh=MeshConfig(data=1, fsdp=-1),
         steps=steps,
         batch_size=BATCH,
         checkpoint_every=1000,

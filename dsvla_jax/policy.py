@@ -18,6 +18,7 @@ from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import decode_actions
+from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import Action, Array, ModelInputs, Observation
@@ -112,14 +113,16 @@ def load_policy_config(run: Path) -> PolicyConfig:
         ) from error
 
 
-def load(run: Path) -> Policy:
-    """The policy of a run folder, with the weights of its newest checkpoint.
+def load(run: Path, mesh: jax.sharding.Mesh | None = None) -> Policy:
+    """The policy of a run folder, with the weights of its newest checkpoint, split over the mesh if there is one.
 
     Raises CheckpointError naming what is missing or does not fit.
     """
     config = load_policy_config(run)
     tokenizer = WordTokenizer.load(run / "tokenizer.json")
     like = jax.eval_shape(lambda: initialize(config.model, jax.random.key(0)))
+    if mesh is not None:
+        like = jax.tree.map(lambda leaf, where: leaf.update(sharding=where), like, shardings(like, mesh))
     checkpoints = RunCheckpoints(run)
     variables = checkpoints.restore_variables(like)
     checkpoints.close()

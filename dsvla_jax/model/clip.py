@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from dsvla_jax.model.attention import attend, join_heads, split_heads
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.lora import KERNEL_INIT, LoraDense, residual_init
+from dsvla_jax.model.partition import constrain
 
 Array = jax.Array
 
@@ -47,6 +48,7 @@ class VisionBlock(nn.Module):
         options = {"use_bias": True, "lora": self.config.lora_for("vision"), "dtype": dtype}
         into_residual = residual_init(vision.layers)
 
+        x = constrain(x, "batch")
         y = layer_norm(vision.norm_eps, "attention_norm")(x)
         query, key, value = (split_heads(LoraDense(vision.width, name=n, **options)(y), vision.heads) for n in "qkv")
         y = join_heads(attend(query, key, value, implementation=self.config.attention))

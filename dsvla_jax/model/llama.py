@@ -13,6 +13,7 @@ from dsvla_jax.model.attention import attend, join_heads, split_heads
 from dsvla_jax.model.clip import over_layers
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.lora import LoraDense, residual_init
+from dsvla_jax.model.partition import constrain
 
 Array = jax.Array
 
@@ -127,6 +128,7 @@ class DecoderBlock(nn.Module):
         language, dtype = self.config.language, self.config.compute_dtype
         options = {"lora": self.config.lora_for("language"), "dtype": dtype}
         into_residual = residual_init(language.layers)
+        x = constrain(x, "batch")
         query_width, kv_width = language.heads * language.head_dim, language.kv_heads * language.head_dim
 
         y = RMSNorm(language.norm_eps, name="attention_norm")(x)
@@ -140,7 +142,7 @@ class DecoderBlock(nn.Module):
             cache = KVCache(key, value)
         attended = attend(query, key, value, mask, self.config.attention)
         if shared is not None and isinstance(prompt, LayerPrompts):
-            tokens = shared.tokens + prompt.rows.astype(dtype)[shared.rows]
+            tokens = shared.tokens + constrain(constrain(prompt.rows.astype(dtype))[shared.rows], "batch")
             prompt_key, prompt_value = (
                 split_heads(project(tokens, adapted=False), language.kv_heads) for project in (to_key, to_value)
             )
@@ -185,7 +187,9 @@ class Llama(nn.Module):
 
     def embed(self, tokens: Array) -> Array:
         """int32 (B, T) -> (B, T, width)."""
-        return self.embedding[tokens].astype(self.config.compute_dtype)
+        # The table is gathered, not what is read from it: of a table split by width, XLA would gather all examples.
+        table = constrain(self.embedding.astype(self.config.compute_dtype), "vocab")
+        return constrain(table[tokens], "batch")
 
     def __call__(
         self,
@@ -220,4 +224,5 @@ class Llama(nn.Module):
         logits = jax.lax.dot_general(
             flat, table.astype(dtype), (((1,), (axis,)), ((), ())), preferred_element_type=jnp.float32
         )
-        return logits.reshape(*hidden.shape[:-1], language.vocab_size)
+        logits = logits.reshape(*hidden.shape[:-1], language.vocab_size)
+        return constrain(logits, "batch", *(None,) * (logits.ndim - 2), "vocab")

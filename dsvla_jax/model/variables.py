@@ -2,9 +2,13 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 from flax import traverse_util
 
 PROJECTION = "projector"
+
+# Parameters that are cast to the model's dtype before anything is computed with them. Norms and positions are not.
+MATRICES = ("kernel", "embedding", "output", "projection", "patch_kernel")
 
 Variables = dict[str, Any]
 
@@ -22,6 +26,13 @@ def split_variables(variables: Variables, regime: str) -> tuple[Variables, Varia
     trainable = {path: leaf for path, leaf in flat.items() if learns(path)}
     frozen = {path: leaf for path, leaf in flat.items() if not learns(path)}
     return traverse_util.unflatten_dict(trainable), traverse_util.unflatten_dict(frozen)
+
+
+def narrow_frozen(frozen: Variables, dtype: jnp.dtype) -> Variables:
+    """The frozen variables with those that the model only ever reads in ``dtype`` kept in it: no result changes."""
+    flat = traverse_util.flatten_dict(frozen)
+    narrow = {path: leaf.astype(dtype) if path[-1] in MATRICES else leaf for path, leaf in flat.items()}
+    return traverse_util.unflatten_dict(narrow)
 
 
 def join_variables(trainable: Variables, frozen: Variables) -> Variables:

@@ -14,6 +14,7 @@ from dsvla_jax.model.clip import layer_norm, over_layers
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.llama import DecoderBlock, LayerPrompts, PromptTokens, RMSNorm, rotary_tables
 from dsvla_jax.model.lora import KERNEL_INIT, LoraDense
+from dsvla_jax.model.partition import constrain
 
 Array = jax.Array
 
@@ -73,7 +74,7 @@ class VisualPrompt(nn.Module):
         x = RMSNorm(prompt.norm_eps, name="visual_blocks_norm")(x[:, : rows.shape[1]])
         x = LoraDense(prompt.width, name="visual_blocks_output", dtype=dtype)(x)
         x = LoraDense(language.width, name="visual_proj", **with_bias)(x)
-        tokens = layer_norm(1e-5, "visual_proj_norm")(x).astype(dtype)
+        tokens = constrain(layer_norm(1e-5, "visual_proj_norm")(x).astype(dtype), "batch")
 
         # Small rows: every layer's prompt starts as the visual tokens. A gate of zero: the language model starts as is.
         count = self.config.prompted_layers

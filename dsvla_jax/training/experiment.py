@@ -11,6 +11,7 @@ from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.training.sharding import MeshConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +52,11 @@ class Experiment:
     """A folder with the language model's vocabulary; empty: the words of the task suite."""
     steps: int = 1000
     batch_size: int = 32
+    """Examples a step, over all devices."""
+    gradient_accumulation: int = 1
+    """Parts in which a batch is computed, one after the other: less memory, the same step."""
+    mesh: MeshConfig = dataclasses.field(default_factory=MeshConfig)
+    """How the devices share the work; the outcome is the same on any mesh."""
     soft_target_sigma: float = 0.0
     """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0

@@ -26,14 +26,27 @@ def target_distributions(number_values: np.ndarray, sigma: float) -> np.ndarray 
     return targets
 
 
+def answer_counts(answer_mask: Array, soft_mask: Array) -> tuple[Array, Array]:
+    """How many tokens of bool (B, T) masks `answer_loss` takes means over: of answers, and of bins in them; 1 for 0."""
+    answer = answer_mask[:, 1:]
+    return jnp.maximum(answer.sum(), 1), jnp.maximum((soft_mask[:, 1:] & answer).sum(), 1)
+
+
 def answer_loss(
-    logits: Array, text_tokens: Array, answer_mask: Array, soft_mask: Array, targets: Array | None
+    logits: Array,
+    text_tokens: Array,
+    answer_mask: Array,
+    soft_mask: Array,
+    targets: Array | None,
+    counts: tuple[Array, Array] | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """Mean cross-entropy over all answer tokens of the batch, each predicted from the token before it.
 
     logits: float32 (B, T, V). text_tokens: int32 (B, T). answer_mask, soft_mask: bool (B, T), True on answer tokens,
     and on those of them that name a bin (a gripper status is 0 or 1 and has no neighbour that is nearly right).
     targets: float32 (V, V) or None, from `target_distributions`.
+    counts: `answer_counts` of the whole batch where these examples are a part of it; the sums over its parts are then
+        the whole batch's loss and metrics.
     Returns the loss and metrics: token accuracy, and the share of bins that are within one of the target's.
     """
     labels, answer, soft = text_tokens[:, 1:], answer_mask[:, 1:], soft_mask[:, 1:]
@@ -41,7 +54,7 @@ def answer_loss(
     likelihood = jnp.take_along_axis(log_probabilities, labels[..., None], axis=-1)[..., 0]
     if targets is not None:
         likelihood = jnp.where(soft, jnp.einsum("btv,btv->bt", log_probabilities, targets[labels]), likelihood)
-    count = jnp.maximum(answer.sum(), 1)
+    count, soft_count = answer_counts(answer_mask, soft_mask) if counts is None else counts
     loss = -jnp.where(answer, likelihood, 0.0).sum() / count
 
     guess = log_probabilities.argmax(-1)
@@ -50,6 +63,6 @@ def answer_loss(
     metrics = {
         "loss": loss,
         "token_accuracy": ((guess == labels) & answer).sum() / count,
-        "bin_within_one": (near & soft & answer).sum() / jnp.maximum((soft & answer).sum(), 1),
+        "bin_within_one": (near & soft & answer).sum() / soft_count,
     }
     return loss, metrics

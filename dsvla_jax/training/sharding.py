@@ -1,23 +1,93 @@
-"""Where arrays live: batches are split over the devices, parameters are copied to each."""
+"""Where arrays live: the mesh of devices, and how batches, parameters and optimizer state are split over it."""
 
-from typing import TypeVar
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
 
 import jax
-from jax.sharding import AxisType, NamedSharding, PartitionSpec
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-Tree = TypeVar("Tree")
-
-
-def make_mesh() -> jax.sharding.Mesh:
-    """All devices along one axis, `data`."""
-    return jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
+from dsvla_jax.errors import UserError
+from dsvla_jax.model.partition import AXIS_RULES, MESH_AXES
 
 
-def batch_sharding() -> NamedSharding:
-    """Leading axis over `data`."""
-    return NamedSharding(make_mesh(), PartitionSpec("data"))
+@dataclasses.dataclass(frozen=True)
+class MeshConfig:
+    """How many devices stand along each axis of the mesh; -1, for one axis, is all that the others leave.
+
+    data: the batch is split, parameters are copied. fsdp: the batch is split, and parameters and optimizer state too.
+    tensor: the hidden width of each layer is split; keep it within a host. The default suits models that fit a device.
+    """
+
+    data: int = -1
+    fsdp: int = 1
+    tensor: int = 1
+
+    def shape(self, devices: int) -> tuple[int, int, int]:
+        """Sizes of the axes on so many devices. Raises UserError where they do not multiply to it."""
+        sizes = [self.data, self.fsdp, self.tensor]
+        named = ", ".join(f"{axis}={size}" for axis, size in zip(MESH_AXES, sizes, strict=True))
+        if sizes.count(-1) > 1 or any(size < 1 and size != -1 for size in sizes):
+            raise UserError(f"mesh: expected positive sizes, and -1 (the rest) for one axis at most; got {named}")
+        known = math.prod(size for size in sizes if size != -1)
+        if devices % known or (-1 not in sizes and known != devices):
+            raise UserError(
+                f"mesh: {named} cannot be laid over {devices} devices; choose sizes with a product of {devices} "
+                "(-1 for the rest), e.g. --mesh.data -1 --mesh.fsdp 1 --mesh.tensor 1"
+            )
+        data, fsdp, tensor = (devices // known if size == -1 else size for size in sizes)
+        return data, fsdp, tensor
 
 
-def replicate(tree: Tree) -> Tree:
-    """The tree with every leaf on every device."""
-    return jax.device_put(tree, NamedSharding(make_mesh(), PartitionSpec()))
+def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
+    """The mesh over these devices, all there are by default."""
+    shape = config.shape(jax.device_count() if devices is None else len(devices))
+    return jax.make_mesh(shape, MESH_AXES, axis_types=(AxisType.Auto,) * 3, devices=devices)
+
+
+def batch_sharding(mesh: Mesh) -> NamedSharding:
+    """Leading axis over `data` and `fsdp`."""
+    return NamedSharding(mesh, PartitionSpec(AXIS_RULES["batch"]))
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchPart:
+    """What one process reads of every batch: part ``index`` of ``count`` equal parts, ``size`` examples long."""
+
+    index: int
+    count: int
+    size: int
+
+
+def batch_part(mesh: Mesh, batch_size: int, accumulation: int = 1) -> BatchPart:
+    """This process's part of a batch; processes whose devices differ along `tensor` alone read the same part.
+
+    Raises UserError where the batch does not divide over the mesh, or a device's share over the accumulated parts.
+    """
+    parts = mesh.shape["data"] * mesh.shape["fsdp"]
+    if batch_size % (parts * accumulation):
+        times = f" x gradient_accumulation {accumulation}" if accumulation > 1 else ""
+        below, step = batch_size // (parts * accumulation), parts * accumulation
+        near = " or ".join(str(size) for size in (below * step, (below + 1) * step) if size)
+        raise UserError(
+            f"batch_size: {batch_size} does not divide over {parts} parts (mesh data {mesh.shape['data']} x fsdp "
+            f"{mesh.shape['fsdp']}){times}; use --batch-size {near}, or another --mesh"
+        )
+    rows = batch_sharding(mesh).addressable_devices_indices_map((batch_size,)).values()
+    bounds = [index[0].indices(batch_size)[:2] for index in rows if index is not None]
+    start, stop = min(low for low, _ in bounds), max(high for _, high in bounds)
+    size = stop - start
+    if size != sum(high - low for low, high in set(bounds)) or start % size or batch_size % size:
+        raise UserError(
+            f"mesh: the examples of one process are not one equal part of the batch on {dict(mesh.shape)}; "
+            "use sizes of data and fsdp of which each process holds a whole block"
+        )
+    return BatchPart(start // size, batch_size // size, size)
+
+
+def put_batch(batch: dict[str, np.ndarray], mesh: Mesh) -> dict[str, jax.Array]:
+    """This process's part of a batch as a part of the one array that all processes share, split by its leading axis."""
+    sharding = batch_sharding(mesh)
+    return {name: jax.make_array_from_process_local_data(sharding, value) for name, value in batch.items()}

@@ -1,19 +1,21 @@
 """The training step as a pure function, and the state that it carries."""
 
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.encoding.encode import EncodingConfig, encode_observation
-from dsvla_jax.model.variables import Variables, join_variables
-from dsvla_jax.model.vla import VLA
+from dsvla_jax.model.partition import constrain, shardings
+from dsvla_jax.model.variables import Variables, join_variables, narrow_frozen, split_variables
+from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
-from dsvla_jax.training.objective import answer_loss, target_distributions
+from dsvla_jax.training.objective import answer_counts, answer_loss, target_distributions
 from dsvla_jax.types import Array, Camera, ModelInputs, Observation
 
 
@@ -24,6 +26,27 @@ class TrainState:
     step: Array
     trainable: Variables
     optimizer: optax.OptState
+
+
+TrainStep = Callable[[TrainState, Variables, dict[str, Array]], tuple[TrainState, dict[str, Array]]]
+
+
+def initial_state(
+    experiment: Experiment,
+    number_values: np.ndarray,
+    optimizer: optax.GradientTransformation,
+    params: Variables | None = None,
+) -> tuple[TrainState, Variables]:
+    """State and frozen variables at step 0: random by the seed, with ``params`` in the place of random ones if given.
+
+    Pure: `make_sharded` makes every leaf where it lives, and none of them is ever whole on one device.
+    """
+    variables = initialize(experiment.model, jax.random.key(experiment.seed), number_values)
+    if params is not None:
+        variables["params"] = params
+    trainable, frozen = split_variables(variables, experiment.regime)
+    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    return state, narrow_frozen(frozen, experiment.model.compute_dtype)
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
@@ -62,8 +85,8 @@ def model_inputs(batch: dict[str, Array], config: EncodingConfig) -> ModelInputs
 
 def make_train_step(
     experiment: Experiment, model: VLA, optimizer: optax.GradientTransformation, number_values: np.ndarray
-) -> Callable[[TrainState, Variables, dict[str, Array]], tuple[TrainState, dict[str, Array]]]:
-    """``step(state, frozen, batch) -> (state, metrics)``, to be jitted by the caller.
+) -> TrainStep:
+    """``step(state, frozen, batch) -> (state, metrics)``, to be jitted by the caller (`jit_train_step`).
 
     Gradients are taken with respect to the trainable variables only: frozen parameters cost no weight gradient.
     """
@@ -71,17 +94,50 @@ def make_train_step(
     targets = None if targets is None else jnp.asarray(targets)
 
     def step(state: TrainState, frozen: Variables, batch: dict[str, Array]):
-        inputs = model_inputs(batch, experiment.encoding)
+        counts = answer_counts(batch["answer_mask"], batch["soft_mask"])
 
-        def loss_of(trainable: Variables):
-            logits = model.apply(join_variables(trainable, frozen), inputs)
-            assert isinstance(logits, jax.Array)
-            return answer_loss(logits, inputs.text_tokens, batch["answer_mask"], batch["soft_mask"], targets)
+        def part(batch: dict[str, Array]) -> tuple[Variables, dict[str, Array]]:
+            inputs = model_inputs(
+                {name: constrain(value, "batch") for name, value in batch.items()}, experiment.encoding
+            )
 
-        (_, metrics), gradients = jax.value_and_grad(loss_of, has_aux=True)(state.trainable)
+            def loss_of(trainable: Variables):
+                logits = model.apply(join_variables(trainable, frozen), inputs)
+                assert isinstance(logits, jax.Array)
+                return answer_loss(
+                    logits, inputs.text_tokens, batch["answer_mask"], batch["soft_mask"], targets, counts
+                )
+
+            gradients, metrics = jax.grad(loss_of, has_aux=True)(state.trainable)
+            return gradients, metrics
+
+        gradients, metrics = _sum_over_parts(part, batch, experiment.gradient_accumulation)
         updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.trainable)
         trainable = cast(Variables, optax.apply_updates(state.trainable, updates))
         metrics["gradient_norm"] = optax.tree.norm(gradients)
         return TrainState(state.step + 1, trainable, optimizer_state), metrics
 
     return step
+
+
+def jit_train_step(step: TrainStep, state: TrainState, mesh: Mesh) -> Any:
+    """The step compiled for a mesh. The state stays split as it is, and its memory is used for the next one."""
+
+    def on_mesh(state: TrainState, frozen: Variables, batch: dict[str, Array]):
+        with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
+            return step(state, frozen, batch)
+
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    return jax.jit(on_mesh, donate_argnums=0, out_shardings=(shardings(state, mesh), everywhere))
+
+
+def _sum_over_parts(part: Callable[[Any], Any], batch: dict[str, Array], count: int) -> Any:
+    """The sum of ``part`` over ``count`` equal parts of a batch, one after the other.
+
+    A part takes every count-th example, so that each device has its share of it without any exchange.
+    """
+    if count == 1:
+        return part(batch)
+    parts = {name: value.reshape(-1, count, *value.shape[1:]).swapaxes(0, 1) for name, value in batch.items()}
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(part, {name: value[0] for name, value in parts.items()}))
+    return jax.lax.scan(lambda total, one: (jax.tree.map(jnp.add, total, part(one)), None), zeros, parts)[0]

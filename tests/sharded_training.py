@@ -1,0 +1,119 @@
+"""Trains a tiny model on virtual devices and prints its losses as JSON: python -m tests.sharded_training OPTIONS.
+
+Tests start it in processes of its own, because the number of devices is fixed once JAX has started.
+"""
+
+import dataclasses
+import json
+import sys
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+import tyro
+
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
+from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
+from dsvla_jax.model.partition import make_sharded
+from dsvla_jax.model.vla import VLA
+from dsvla_jax.training.experiment import Experiment, OptimizerConfig
+from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh, put_batch
+from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
+
+VOCABULARY = 40
+
+
+def tiny_experiment(fusion: Any = "prefix", points: bool = True, **changes: Any) -> Experiment:
+    """Both towers with adapters, and a batch of 16 that learns something in 20 steps."""
+    encoding = EncodingConfig(
+        image_size=32,
+        patch_size=16,
+        points=PointTokenizerConfig(num_points=32, group_sizes=(16, 4), neighbours=4, width=32),
+        style="compact",
+        max_text_length=16,
+        use_points=points,
+    )
+    model = ModelConfig(
+        vision=VisionConfig(image_size=32, patch_size=16, width=32, layers=2, heads=2),
+        language=LanguageConfig(vocab_size=VOCABULARY, width=32, layers=2, heads=2, kv_heads=2, ffn=64),
+        fusion=fusion,
+        visual_prompt=VisualPromptConfig(width=32, layers=2, heads=2, ffn=64),
+        lora=LoraConfig(rank=2),
+        remat="none",
+    )
+    experiment = Experiment(
+        encoding, model, optimizer=OptimizerConfig(learning_rate=1e-3), regime="lora", steps=20, batch_size=16
+    )
+    return dataclasses.replace(experiment, **changes)
+
+
+def batches(experiment: Experiment) -> list[dict[str, np.ndarray]]:
+    """Three batches of noise, whose answers have different lengths, so that no mean over parts is right by chance."""
+    rng = np.random.default_rng(0)
+    size, image, text = experiment.batch_size, 32, experiment.encoding.max_text_length
+    intrinsics = np.array([[-40, 0, 16], [0, -40, 16], [0, 0, 1]], np.float32)
+
+    def batch() -> dict[str, np.ndarray]:
+        place, length = np.arange(text), rng.integers(1, 8, (size, 1))
+        answer = (place >= 8) & (place < 8 + length)
+        return {
+            "rgb": rng.integers(0, 255, (size, image, image, 3), np.uint8),
+            "depth": rng.uniform(0.8, 1.2, (size, image, image)).astype(np.float32),
+            "intrinsics": np.broadcast_to(intrinsics, (size, 3, 3)),
+            "world_from_camera": np.broadcast_to(np.eye(4, dtype=np.float32), (size, 4, 4)),
+            "text_tokens": rng.integers(4, VOCABULARY, (size, text)).astype(np.int32),
+            "text_mask": np.ones((size, text), bool),
+            "answer_mask": answer,
+            "soft_mask": answer & (rng.random((size, text)) < 0.5),
+        }
+
+    return [batch() for _ in range(3)]
+
+
+def train(experiment: Experiment, devices: int) -> list[float]:
+    """The losses of a run on the first so many devices (0: all)."""
+    mesh = make_mesh(experiment.mesh, jax.devices()[:devices] if devices else None)
+    values = np.full(VOCABULARY, np.nan, np.float32)
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state, frozen = make_sharded(partial(initial_state, experiment, values, optimizer), mesh)
+    step = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, values), state, mesh)
+    part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
+    mine = slice(part.index * part.size, (part.index + 1) * part.size)
+    data = [put_batch({key: value[mine] for key, value in batch.items()}, mesh) for batch in batches(experiment)]
+    losses = []
+    for index in range(experiment.steps):
+        before = state
+        with jax.transfer_guard("disallow"):
+            state, metrics = step(state, frozen, data[index % 3])
+        assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before)), "the state is donated to the step"
+        losses.append(float(metrics["loss"]))
+    return losses
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Where to train. meshes: "data,fsdp,tensor" each. devices: of each mesh, 0 for all."""
+
+    meshes: tuple[str, ...]
+    devices: tuple[int, ...]
+    accumulation: tuple[int, ...]
+    coordinator: str = ""
+    process: int = 0
+    processes: int = 1
+    fusion: str = "prefix"
+    points: bool = False
+
+
+def main(options: Options) -> None:
+    if options.coordinator:
+        jax.distributed.initialize(options.coordinator, options.processes, options.process)
+    for mesh, devices, parts in zip(options.meshes, options.devices, options.accumulation, strict=True):
+        config = MeshConfig(*map(int, mesh.split(",")))
+        experiment = tiny_experiment(options.fusion, options.points, mesh=config, gradient_accumulation=parts)
+        print("losses", json.dumps(train(experiment, devices)), flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options)))

@@ -1,0 +1,191 @@
+"""Training on meshes: the same losses on any of them, memory that shrinks with them, and errors that name the fix."""
+
+import dataclasses
+import json
+import math
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from socket import socket
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import traverse_util
+from jax.sharding import AbstractMesh
+
+from configs import get_config
+from dsvla_jax.errors import UserError
+from dsvla_jax.model.partition import MESH_AXES, shardings
+from dsvla_jax.model.variables import join_variables, narrow_frozen, split_variables
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh
+from dsvla_jax.training.state import initial_state, make_optimizer, model_inputs
+from tests.sharded_training import batches, tiny_experiment
+
+ROOT = Path(__file__).parent.parent
+
+
+def start(devices: int, *arguments: str) -> subprocess.Popen[str]:
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "JAX_PLATFORMS": "cpu",
+        # Programs this small take longer to compile than to run: let the compiler do little, and do it once.
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0",
+        "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".cache" / "xla"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    command = [sys.executable, "-m", "tests.sharded_training", *arguments]
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def losses(process: subprocess.Popen[str]) -> list[list[float]]:
+    output, errors = process.communicate(timeout=900)
+    assert process.returncode == 0, errors
+    return [json.loads(line.removeprefix("losses ")) for line in output.splitlines() if line.startswith("losses ")]
+
+
+def curves_on(runs: dict[str, tuple[str, int, int]], *more: str) -> dict[str, list[float]]:
+    """Losses by name of run; a run has sizes of the mesh, its devices (0: all 8) and parts of the batch."""
+    meshes, devices, parts = zip(*runs.values(), strict=True)
+    options = ["--meshes", *meshes, "--devices", *map(str, devices), "--accumulation", *map(str, parts)]
+    return dict(zip(runs, losses(start(8, *options, *more)), strict=True))
+
+
+def curves_of_processes(*more: str) -> list[list[float]]:
+    """The losses that two processes of 4 devices each report."""
+    with socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    options = ["--meshes", "2,2,2", "--devices", "0", "--accumulation", "1", "--coordinator", address, *more]
+    processes = [start(4, *options, "--process", str(index), "--processes", "2") for index in range(2)]
+    return [losses(process)[0] for process in processes]
+
+
+def require_learning_alike(curve: list[float], expected: list[float]) -> None:
+    assert len(expected) == 20
+    assert np.mean(expected[-3:]) < np.mean(expected[:3]), "it learns"
+    np.testing.assert_allclose(curve, expected, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def one_device() -> dict[str, list[float]]:
+    return curves_on({"one": ("1,1,1", 1, 1), "2 x 2 x 2 in two parts": ("2,2,2", 0, 2)})
+
+
+def test_losses_are_the_same_on_one_device_and_on_eight(one_device):
+    require_learning_alike(one_device["2 x 2 x 2 in two parts"], one_device["one"])
+
+
+def test_losses_are_the_same_in_two_processes(one_device):
+    for curve in curves_of_processes():
+        require_learning_alike(curve, one_device["one"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fusion", ["prefix", "adapter"])
+def test_losses_are_the_same_on_any_mesh(fusion):
+    runs = {
+        "one": ("1,1,1", 1, 1),
+        "data": ("8,1,1", 0, 1),
+        "fsdp": ("1,8,1", 0, 1),
+        "2 x 2 x 2": ("2,2,2", 0, 1),
+        "in four parts": ("1,4,1", 4, 4),
+    }
+    options = ("--fusion", fusion, "--points")
+    curves = curves_on(runs, *options)
+    for curve in (*curves.values(), *curves_of_processes(*options)):
+        require_learning_alike(curve, curves["one"])
+
+
+def bytes_on_each(tree: Any, mesh: AbstractMesh) -> int:
+    def size(leaf: Any, where: Any) -> int:
+        return math.prod(where.shard_shape(leaf.shape)) * leaf.dtype.itemsize
+
+    return sum(jax.tree.leaves(jax.tree.map(size, tree, shardings(tree, mesh))))
+
+
+@pytest.fixture(scope="module")
+def paper() -> tuple[Any, Any]:
+    experiment = get_config("paper_7b")
+    values = np.full(experiment.model.language.vocab_size, np.nan, np.float32)
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    return jax.eval_shape(partial(initial_state, experiment, values, optimizer))
+
+
+def whole(tree: Any) -> int:
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+@pytest.mark.parametrize("shape", [(1, 16, 1), (1, 256, 1), (4, 16, 4)])
+def test_state_and_base_are_split_and_hardly_anything_is_copied(paper, shape):
+    state, frozen = paper
+    mesh = AbstractMesh(shape, MESH_AXES)
+    ways, copied = shape[1] * shape[2], 8 * 2**20
+    assert bytes_on_each(frozen, mesh) < whole(frozen) / ways + copied
+    assert bytes_on_each(state, mesh) < whole(state) / shape[1] + copied
+    assert bytes_on_each(frozen, AbstractMesh((16, 1, 1), MESH_AXES)) == whole(frozen)
+
+
+def test_optimizer_memory_is_that_of_what_learns(paper):
+    state, _ = paper
+    moments = 2 * whole(state.trainable)
+    assert moments <= whole(state.optimizer) < moments + 100
+
+
+def test_the_frozen_base_is_kept_in_the_dtype_that_it_is_used_in(paper):
+    _, frozen = paper
+    wide = {path[-1] for path, leaf in traverse_util.flatten_dict(frozen).items() if leaf.dtype != "bfloat16"}
+    assert wide == {"scale", "bias", "class_embedding", "positional_embedding"}
+
+
+def test_narrowing_the_frozen_base_changes_nothing():
+    experiment = tiny_experiment("adapter", points=False)
+    experiment = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, dtype="bfloat16"))
+    trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0)), "lora")
+    batch = batches(experiment)[0]
+
+    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+    def logits(frozen):
+        inputs = model_inputs(batch, experiment.encoding)
+        return VLA(experiment.model).apply(join_variables(trainable, frozen), inputs)
+
+    np.testing.assert_array_equal(logits(narrow_frozen(frozen, jnp.dtype("bfloat16"))), logits(frozen))
+
+
+@pytest.mark.parametrize(
+    ("config", "devices", "expected"),
+    [
+        (MeshConfig(), 8, (8, 1, 1)),
+        (MeshConfig(2, -1, 2), 8, (2, 2, 2)),
+        (MeshConfig(1, 8, 1), 8, (1, 8, 1)),
+        (MeshConfig(3, -1, 1), 8, "data=3, fsdp=-1, tensor=1 cannot be laid over 8 devices"),
+        (MeshConfig(2, 2, 1), 8, "product of 8"),
+        (MeshConfig(-1, -1, 1), 8, "-1 .* for one axis at most"),
+        (MeshConfig(0, -1, 1), 8, "positive sizes"),
+    ],
+)
+def test_sizes_of_a_mesh(config, devices, expected):
+    if isinstance(expected, tuple):
+        assert config.shape(devices) == expected
+    else:
+        with pytest.raises(UserError, match=expected):
+            config.shape(devices)
+
+
+def test_a_batch_that_does_not_divide_is_an_error_with_sizes_that_do():
+    mesh = make_mesh(MeshConfig(1, 1, 1), jax.devices()[:1])
+    part = batch_part(mesh, 6, 3)
+    assert (part.index, part.count, part.size) == (0, 1, 6)
+    with pytest.raises(
+        UserError, match=r"batch_size: 8 does not divide .*gradient_accumulation 3.*--batch-size 6 or 9"
+    ):
+        batch_part(mesh, 8, 3)
