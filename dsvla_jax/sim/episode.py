@@ -134,7 +134,9 @@ class Environment:
         """The states at the start and after each key pose of a plan: pose (B, M, A, 7), gripper_open (B, M, A)."""
         states = [state]
         for m in range(plan.pose.shape[1]):
-            states.append(self.execute(states[-1], Action(plan.pose[:, m], plan.gripper_open[:, m])))
+            state = self.execute(states[-1], Action(plan.pose[:, m], plan.gripper_open[:, m]))
+            # XLA's CPU client stops for good when more than 32 programs that wait for each other are in its queue.
+            states.append(jax.block_until_ready(state))
         return states
 
     def observe(self, state: SimState) -> Observation:
