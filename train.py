@@ -25,7 +25,9 @@ from data_pipelines.samples import make_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.encoding.text import WordTokenizer, load_tokenizer
+from dsvla_jax.encoding.number_targets import number_rows
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
+from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA, initialize
@@ -33,6 +35,9 @@ from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
+
+# Embeddings have more rows than the vocabulary has tokens where their number was rounded up, by fewer than so many.
+PADDING_ROWS = 1024
 
 
 def main(experiment: Experiment, run: Path, resume: bool) -> None:
@@ -78,8 +83,8 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
         save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model), tokenizer)
         checkpoints.save_base(frozen)
 
-    train_step = make_train_step(experiment, model, optimizer, tokenizer.number_values)
-    train_step = jit_train_step(train_step, state, mesh)
+    targets = number_rows(tokenizer, experiment.encoding.style).targets(experiment.soft_target_sigma)
+    train_step = jit_train_step(make_train_step(experiment, model, optimizer, targets), state, mesh)
     first = int(state.step)
     with Metrics(run, first) as metrics, tqdm(total=experiment.steps, initial=first, unit="step", desc="train") as bar:
         for step in range(first, experiment.steps):
@@ -99,11 +104,11 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
     print(f"trained: {run} (evaluate it with: python eval.py {run})")
 
 
-def tokenizer_of(experiment: Experiment) -> WordTokenizer:
+def tokenizer_of(experiment: Experiment) -> Tokenizer:
     """The vocabulary of the experiment, which has to be that of its language model."""
     tokenizer = load_tokenizer(experiment.tokenizer) if experiment.tokenizer else suite_tokenizer()
     expected = experiment.model.language.vocab_size
-    if tokenizer.vocab_size != expected:
+    if not tokenizer.vocab_size <= expected < tokenizer.vocab_size + PADDING_ROWS:
         raise UserError(
             f"tokenizer: {experiment.tokenizer or 'the words of the task suite'} has {tokenizer.vocab_size} tokens, "
             f"model.language.vocab_size is {expected}; they must be of one language model"

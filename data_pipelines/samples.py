@@ -3,9 +3,10 @@
 The sample is a flat dict of arrays of fixed shape, in which one- and two-armed robots look alike:
 
     rgb uint8 (H, W, 3), depth float32 (H, W), intrinsics float32 (3, 3), world_from_camera float32 (4, 4),
-    text_tokens int32 (T,), text_mask bool (T,), answer_mask bool (T,), soft_mask bool (T,).
+    text_tokens int32 (T,), text_mask bool (T,), answer_mask bool (T,), number_rows int32 (T,).
 
-`answer_mask` is True on the tokens to learn; `soft_mask` on those of them that name a bin of position or rotation.
+`answer_mask` is True on the tokens to learn; `number_rows` says of those of them that choose a bin of position or
+rotation which choice it is (`encoding.number_targets`), and is 0 elsewhere.
 """
 
 from collections.abc import Callable
@@ -17,8 +18,9 @@ from data_pipelines.augment import jitter_state, perturb_keypoint, random_offset
 from data_pipelines.episodes import Frame
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
-from dsvla_jax.encoding.prompts import Style, format_answer
-from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar, vocabulary
+from dsvla_jax.encoding.number_targets import number_rows
+from dsvla_jax.encoding.prompts import format_answer
+from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
 from dsvla_jax.sim.tasks import TASKS
 
 Sample = dict[str, np.ndarray]
@@ -31,10 +33,13 @@ def suite_tokenizer() -> WordTokenizer:
 
 
 def make_sampler(
-    data: DataConfig, encoding: EncodingConfig, tokenizer: WordTokenizer
+    data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer
 ) -> Callable[[Frame, np.random.Generator], Sample]:
-    """``sample(frame, rng)``: varies the frame as `data` says and writes its prompt and answer."""
-    soft_slots = {arms: _soft_slots(tokenizer, arms, encoding.style) for arms in (1, 2)}
+    """``sample(frame, rng)``: varies the frame as `data` says and writes its prompt and answer.
+
+    Raises UserError where the tokenizer can not write answers number by number.
+    """
+    numbers = number_rows(tokenizer, encoding.style)
     codec = encoding.codec
 
     def sample(frame: Frame, rng: np.random.Generator) -> Sample:
@@ -57,8 +62,8 @@ def make_sampler(
         bins = np.asarray(codec.encode(frame["target_pose"], frame["target_gripper"]))
         answer = format_answer(bins, encoding.style)
         tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
-        soft_mask = np.zeros_like(answer_mask)
-        soft_mask[answer_mask] = soft_slots[len(bins)]
+        rows = np.zeros(len(tokens), np.int32)
+        rows[answer_mask] = numbers.rows(bins)
         return {
             "rgb": frame["rgb"],
             "depth": frame["depth"],
@@ -67,14 +72,7 @@ def make_sampler(
             "text_tokens": tokens,
             "text_mask": mask,
             "answer_mask": answer_mask,
-            "soft_mask": soft_mask,
+            "number_rows": rows,
         }
 
     return sample
-
-
-def _soft_slots(tokenizer: WordTokenizer, arms: int, style: Style) -> np.ndarray:
-    """bool (L,): which answer tokens name a bin, of which the neighbours are nearly right too."""
-    grammar = build_answer_grammar(tokenizer, arms, style)
-    # A gripper status is a free slot as well, but of two values only.
-    return (np.asarray(grammar.forced) < 0) & (np.asarray(grammar.allowed).sum(-1) > 2)

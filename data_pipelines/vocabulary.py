@@ -30,7 +30,7 @@ def main(options: Options) -> None:
     suite = [text for task in TASKS.values() for text in task.all_instructions()]
     tokenizer = WordTokenizer(vocabulary([*suite, *EpisodeReader(options.folder).instructions]))
     options.out.mkdir(parents=True, exist_ok=True)
-    tokenizer.save(options.out / "tokenizer.json")
+    tokenizer.save(options.out)
     print(f"{options.out / 'tokenizer.json'}: {tokenizer.vocab_size} tokens; train with")
     print(f"  --tokenizer {options.out} --model.language.vocab-size {tokenizer.vocab_size}")
 

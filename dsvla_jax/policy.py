@@ -10,14 +10,17 @@ import cattrs
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
-from dsvla_jax.encoding.prompts import parse_answer
-from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar
+from dsvla_jax.encoding.grammar import build_answer_grammar
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer
+from dsvla_jax.encoding.prompts import format_answer
+from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.model.config import ModelConfig
-from dsvla_jax.model.decode import decode_actions
+from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
@@ -32,19 +35,41 @@ class PolicyConfig:
     model: ModelConfig
 
 
-@partial(jax.jit, static_argnames=("config", "tokenizer"))
+# Batches are filled up to one of these sizes, so that any size runs without compiling again; beyond, to a multiple of
+# the last. Prompts are padded to a multiple of PROMPT_TOKENS.
+BATCH_SIZES = (1, 2, 4, 8, 16, 25, 32, 50, 64, 100, 128)
+PROMPT_TOKENS = 64
+
+
+@struct.dataclass
+class Decision:
+    """What a policy decided for a batch.
+
+    action: the next key poses. texts: the answers that name them. log_probs, entropies: float32 (B, A, 8), of each
+    number among those that its slot admits, and in nats of its slot's distribution: how sure the policy was.
+    """
+
+    action: Action
+    texts: list[str] = struct.field(pytree_node=False)
+    log_probs: np.ndarray
+    entropies: np.ndarray
+
+
+@partial(jax.jit, static_argnames=("config", "tokenizer", "decoding"))
 def _decode(
     config: PolicyConfig,
-    tokenizer: WordTokenizer,
+    tokenizer: Tokenizer,
+    decoding: Decoding,
     variables: Variables,
     observation: Observation,
     text_tokens: Array,
     text_mask: Array,
-) -> Array:
+    key: Array | None,
+) -> Decoded:
     picture = encode_observation(observation, config.encoding)
     inputs = ModelInputs(**picture, text_tokens=text_tokens, text_mask=text_mask)
     grammar = build_answer_grammar(tokenizer, observation.pose.shape[1], config.encoding.style)
-    return decode_actions(VLA(config.model), variables, inputs, grammar)[0]
+    return decode_actions(VLA(config.model), variables, inputs, grammar, decoding, key)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +78,8 @@ class Policy:
 
     config: PolicyConfig
     variables: Variables
-    tokenizer: WordTokenizer
+    tokenizer: Tokenizer
+    decoding: Decoding = GREEDY
 
     @property
     def codec(self) -> PoseCodec:
@@ -75,27 +101,52 @@ class Policy:
     def act(
         self, observation: Observation, instructions: Sequence[str], keypoints: np.ndarray | None
     ) -> tuple[Action, list[str]]:
-        """The next key pose of every robot of a batch, and the answer texts that name it.
+        """The next key pose of every robot of a batch, and the answer texts that name it; see `decide`."""
+        decision = self.decide(observation, instructions, keypoints)
+        return decision.action, decision.texts
 
-        observation: with a leading axis B; pose (B, A, 7). keypoints: float32 (B, A, 3), the active one of each arm,
-        in metres and the world frame, or None. An answer is well-formed whatever the weights are.
+    def decide(
+        self,
+        observation: Observation,
+        instructions: Sequence[str],
+        keypoints: np.ndarray | None,
+        key: Array | None = None,
+    ) -> Decision:
+        """The next key pose of every robot of a batch. It is well-formed whatever the weights are.
+
+        observation: with a leading axis B of any size; pose (B, A, 7). keypoints: float32 (B, A, 3), the active one of
+        each arm, in metres and the world frame, or None. key: for ``decoding`` that samples.
         """
-        poses, grippers = np.asarray(observation.pose), np.asarray(observation.gripper_open)
+        size, poses, grippers = len(instructions), np.asarray(observation.pose), np.asarray(observation.gripper_open)
         encoded = [
             self.encode_prompt(text, poses[i], grippers[i], None if keypoints is None else keypoints[i])
             for i, text in enumerate(instructions)
         ]
         tokens, masks = (np.stack(column) for column in zip(*encoded, strict=True))
-        answers = _decode(self.config, self.tokenizer, self.variables, observation, tokens, masks)
-        texts = [self.tokenizer.decode([int(token) for token in row]) for row in np.asarray(answers)]
-        bins = np.stack([parse_answer(text, poses.shape[1], self.config.encoding.style) for text in texts])
-        return jax.vmap(self.codec.decode)(jnp.asarray(bins)), texts
+        longest = -(-int(masks.sum(axis=1).max()) // PROMPT_TOKENS) * PROMPT_TOKENS
+        tokens, masks = tokens[:, :longest], masks[:, :longest]
+        if full_size(size) > size:
+            # Others of the batch have no influence, so any will do to fill it up.
+            rows = np.arange(full_size(size)) % size
+            observation, tokens, masks = jax.tree.map(lambda x: x[rows], (observation, tokens, masks))
+        decoded = _decode(self.config, self.tokenizer, self.decoding, self.variables, observation, tokens, masks, key)
+        bins, log_probs, entropies = (
+            np.asarray(x)[:size] for x in (decoded.integers, decoded.log_probs, decoded.entropies)
+        )
+        texts = [format_answer(row, self.config.encoding.style) for row in bins]
+        return Decision(jax.vmap(self.codec.decode)(jnp.asarray(bins)), texts, log_probs, entropies)
 
 
-def save_policy_config(run: Path, config: PolicyConfig, tokenizer: WordTokenizer) -> None:
+def full_size(size: int) -> int:
+    """The size to which a batch of ``size`` is filled up."""
+    largest = BATCH_SIZES[-1]
+    return next((full for full in BATCH_SIZES if full >= size), -(-size // largest) * largest)
+
+
+def save_policy_config(run: Path, config: PolicyConfig, tokenizer: Tokenizer) -> None:
     """Writes what `load` needs besides a checkpoint."""
     (run / "policy.json").write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
-    tokenizer.save(run / "tokenizer.json")
+    save_tokenizer(tokenizer, run)
 
 
 def load_policy_config(run: Path) -> PolicyConfig:
@@ -113,17 +164,17 @@ def load_policy_config(run: Path) -> PolicyConfig:
         ) from error
 
 
-def load(run: Path, mesh: jax.sharding.Mesh | None = None) -> Policy:
+def load(run: Path, mesh: jax.sharding.Mesh | None = None, decoding: Decoding = GREEDY) -> Policy:
     """The policy of a run folder, with the weights of its newest checkpoint, split over the mesh if there is one.
 
     Raises CheckpointError naming what is missing or does not fit.
     """
     config = load_policy_config(run)
-    tokenizer = WordTokenizer.load(run / "tokenizer.json")
+    tokenizer = load_tokenizer(run)
     like = jax.eval_shape(lambda: initialize(config.model, jax.random.key(0)))
     if mesh is not None:
         like = jax.tree.map(lambda leaf, where: leaf.update(sharding=where), like, shardings(like, mesh))
     checkpoints = RunCheckpoints(run)
     variables = checkpoints.restore_variables(like)
     checkpoints.close()
-    return Policy(config, variables, tokenizer)
+    return Policy(config, variables, tokenizer, decoding)

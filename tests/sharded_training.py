@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 
 from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.partition import make_sharded
@@ -23,6 +24,13 @@ from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh, put_b
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
 
 VOCABULARY = 40
+# One choice of a bin, between four tokens.
+TARGETS = NumberTargets(
+    tokens=np.arange(4, 8, dtype=np.int32),
+    distances=np.array([[np.inf] * 4, [0, 1, 2, 3]], np.float32),
+    weights=np.array([[0.0] * 4, [0.6, 0.3, 0.1, 0.0]], np.float32),
+    begins=np.array([False, True]),
+)
 
 
 def tiny_experiment(fusion: Any = "prefix", points: bool = True, **changes: Any) -> Experiment:
@@ -66,7 +74,7 @@ def batches(experiment: Experiment) -> list[dict[str, np.ndarray]]:
             "text_tokens": rng.integers(4, VOCABULARY, (size, text)).astype(np.int32),
             "text_mask": np.ones((size, text), bool),
             "answer_mask": answer,
-            "soft_mask": answer & (rng.random((size, text)) < 0.5),
+            "number_rows": np.where(answer & (rng.random((size, text)) < 0.5), 1, 0).astype(np.int32),
         }
 
     return [batch() for _ in range(3)]
@@ -78,7 +86,7 @@ def train(experiment: Experiment, devices: int) -> list[float]:
     values = np.full(VOCABULARY, np.nan, np.float32)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state, frozen = make_sharded(partial(initial_state, experiment, values, optimizer), mesh)
-    step = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, values), state, mesh)
+    step = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, TARGETS), state, mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     mine = slice(part.index * part.size, (part.index + 1) * part.size)
     data = [put_batch({key: value[mine] for key, value in batch.items()}, mesh) for batch in batches(experiment)]

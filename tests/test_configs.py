@@ -11,6 +11,7 @@ from configs import config_names, get_config
 from data_pipelines.episodes import Frame
 from data_pipelines.samples import make_sampler, suite_tokenizer
 from dsvla_jax.encoding.encode import build_prompt, encode_text
+from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import front_camera
@@ -79,7 +80,8 @@ def test_row_trains(name: str):
     trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0), values), experiment.regime)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
-    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, values))
+    targets = number_rows(suite_tokenizer(), experiment.encoding.style).targets(experiment.soft_target_sigma)
+    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, targets))
     losses = []
     for _ in range(experiment.steps):
         state, metrics = step(state, frozen, batch)

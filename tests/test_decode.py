@@ -1,43 +1,31 @@
-"""Decoding: the cache against the full forward pass, independence of batch-mates, well-formed answers."""
+"""Decoding: against the full forward pass, independence of batch-mates, well-formed answers, ways to choose."""
 
 import dataclasses
-from typing import NamedTuple
+import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.encoding.prompts import STYLES, parse_answer
-from dsvla_jax.encoding.text import WordTokenizer, build_answer_grammar, vocabulary
+from dsvla_jax.encoding.grammar import build_answer_grammar
+from dsvla_jax.encoding.prompts import format_answer, parse_answer
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
-from dsvla_jax.model.decode import decode_actions, make_decoder
+from dsvla_jax.model.decode import GREEDY, Decoding, decode_actions, make_decoder
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
-from tests.decoding import check_padding_and_batch_mates
+from tests.decoding import check_against_the_full_forward_pass, check_padding_and_batch_mates, small_grammar
+from tests.vocabularies import small_tokenizer
 
-TOKENIZER = WordTokenizer(vocabulary([]))
-VOCAB = TOKENIZER.vocab_size
-EOS = TOKENIZER.eos_id
+VOCAB = 40
 CONFIG = ModelConfig(
     vision=VisionConfig(image_size=16, patch_size=8, width=32, layers=1, heads=4),
     language=LanguageConfig(vocab_size=VOCAB, width=32, layers=2, heads=4, kv_heads=2, ffn=48),
     lora=LoraConfig(rank=2, alpha=5.0),
 )
-# Template tokens in front, single and double ones between free slots, adjacent free slots, and the end.
-FORCED = np.array([5, 6, -1, 7, -1, 7, -1, 8, 9, -1, -1, EOS], np.int32)
+GRAMMAR = small_grammar()
 PROMPT_LENGTHS = np.array([9, 4, 1])
-
-
-class Grammar(NamedTuple):
-    forced: np.ndarray
-    allowed: np.ndarray
-    forbidden: np.ndarray = np.zeros((0, 1), np.int32)
-
-
-def make_grammar(forced=FORCED, seed=0):
-    allowed = np.random.default_rng(seed).random((len(forced), VOCAB)) < 0.4
-    return Grammar(forced, allowed, np.zeros((0, len(forced)), np.int32))
 
 
 def make_prompts(lengths=PROMPT_LENGTHS, padded=9, seed=0) -> ModelInputs:
@@ -52,9 +40,8 @@ def make_prompts(lengths=PROMPT_LENGTHS, padded=9, seed=0) -> ModelInputs:
     )
 
 
-@pytest.fixture(scope="module")
-def variables():
-    variables = initialize(CONFIG, jax.random.key(0))
+def random_variables(config: ModelConfig):
+    variables = jax.jit(lambda: initialize(config, jax.random.key(0)))()
     keys = jax.random.key(7)
     return {
         "params": jax.tree.map(lambda x: x * 2.0, variables["params"]),
@@ -62,96 +49,141 @@ def variables():
     }
 
 
-def teacher_forced_logits(variables, prompts, answers):
-    """The full forward pass over prompt + answer: logits (B, L, V) that predict each answer token."""
-    lengths = np.asarray(prompts.text_mask.sum(axis=1))
-    texts = np.zeros((len(lengths), lengths.max() + answers.shape[1]), np.int32)
-    for row, prompt, length, answer in zip(texts, np.asarray(prompts.text_tokens), lengths, answers, strict=True):
-        row[: length + len(answer)] = [*prompt[:length], *answer]
-    inputs = dataclasses.replace(prompts, text_tokens=jnp.asarray(texts), text_mask=jnp.ones(texts.shape, bool))
-    logits = jax.jit(VLA(CONFIG).apply)(variables, inputs)
-    return jnp.stack([row[n - 1 : n - 1 + answers.shape[1]] for row, n in zip(logits, lengths, strict=True)])
+@pytest.fixture(scope="module")
+def variables():
+    return random_variables(CONFIG)
 
 
-@pytest.mark.parametrize("forced", [FORCED, np.array([-1, -1, 4, -1, 4, -1], np.int32)])
-def test_decoding_is_the_greedy_choice_of_the_full_forward_pass(variables, forced):
-    grammar, prompts = make_grammar(forced), make_prompts()
-    tokens, log_probs = make_decoder(VLA(CONFIG), grammar)(variables, prompts)
-    logits = teacher_forced_logits(variables, prompts, tokens)
-    masked = jnp.where(grammar.allowed, logits, -jnp.inf)
-    expected = jnp.where(forced >= 0, forced, masked.argmax(axis=-1))
-    np.testing.assert_array_equal(tokens, expected)
-    reference = jnp.take_along_axis(jax.nn.log_softmax(masked), tokens[..., None], axis=-1)[..., 0]
-    np.testing.assert_allclose(log_probs, jnp.where(forced >= 0, 0.0, reference), atol=1e-4)
+@functools.cache
+def decoder(decoding: Decoding = GREEDY):
+    """Compiled once for each way to choose."""
+    return make_decoder(VLA(CONFIG), GRAMMAR, decoding)
+
+
+def always(token_logits: dict[int, float]):
+    """Variables of a model that has the same logits after any text."""
+    shapes = jax.eval_shape(lambda: initialize(CONFIG, jax.random.key(0)))
+    variables = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    params = variables["params"]
+    params["language"]["norm"]["scale"] += 1
+    params["language"]["embedding"] += 1
+    for token, logit in token_logits.items():
+        params["language"]["output"][:, token] = logit / 32
+    return variables
+
+
+def test_decoding_is_the_best_choice_of_the_full_forward_pass(variables):
+    check_against_the_full_forward_pass(CONFIG, GRAMMAR, variables, make_prompts())
 
 
 def test_prefill_and_extend_give_the_logits_of_the_full_forward_pass(variables):
     model, prompts = VLA(CONFIG), make_prompts(np.array([9, 9]))
     full = jax.jit(model.apply)(variables, prompts)
     extend = jax.jit(lambda *args: model.apply(variables, *args, method="extend"))
+    logits = jax.jit(lambda *args: model.apply(variables, *args, method="lm_head"))
     head = dataclasses.replace(prompts, text_tokens=prompts.text_tokens[:, :4], text_mask=prompts.text_mask[:, :4])
-    logits, cache = jax.jit(lambda head: model.apply(variables, head, 5, method="prefill"))(head)
-    np.testing.assert_allclose(logits, full[:, 3], atol=1e-4)
+    hidden, cache = jax.jit(lambda head: model.apply(variables, head, 5, method="prefill"))(head)
+    np.testing.assert_allclose(logits(hidden), full[:, 3], atol=1e-4)
     slots = cache.keys.shape[3]
     start = slots - 5
     for first, count in ((4, 2), (6, 1), (7, 1)):
         positions = start - 4 + first + jnp.arange(count)[None].repeat(2, axis=0)
         mask = jnp.arange(slots) <= positions[..., None]
         chunk = prompts.text_tokens[:, first : first + count]
-        logits, cache = extend(chunk, positions, mask, cache, start - 4 + first)
-        np.testing.assert_allclose(logits, full[:, first + count - 1], atol=1e-4)
+        hidden, cache = extend(chunk, positions, mask, cache, start - 4 + first)
+        np.testing.assert_allclose(logits(hidden), full[:, first : first + count], atol=1e-4)
+    some = np.array([3, 17, 5])
+    np.testing.assert_allclose(logits(hidden, some), full[:, 7:8, some], atol=1e-4)
 
 
 def test_padding_and_batch_mates_never_change_an_answer(variables):
-    check_padding_and_batch_mates(
-        CONFIG, make_grammar(), variables, make_prompts(), make_prompts(seed=5), PROMPT_LENGTHS
-    )
-
-
-@pytest.mark.parametrize("style", STYLES)
-def test_random_weights_give_well_formed_actions(variables, style):
-    arms = {"compact": 1, "paper": 2}[style]
-    decode = make_decoder(VLA(CONFIG), build_answer_grammar(TOKENIZER, arms, style))
-    seen = set()
-    for seed in range(5):
-        lengths = np.random.default_rng(seed).integers(1, 10, 100)
-        weights = jax.tree.map(lambda x, s=seed: x * (1.0 + s), variables)
-        for answer in np.asarray(decode(weights, make_prompts(lengths, seed=seed))[0]):
-            assert answer[-1] == EOS
-            seen.add(parse_answer(TOKENIZER.decode(answer), arms, style).tobytes())
-    assert len(seen) > 50
-
-
-def test_forbidden_combinations_never_come_out(variables):
-    # An embedding that always answers "0" wherever that is allowed.
-    zero = TOKENIZER.encode("0")[0]
-    params = jax.tree.map(jnp.zeros_like, variables["params"])
-    params["language"]["norm"]["scale"] = jnp.ones(32)
-    params["language"]["embedding"] = jnp.ones((VOCAB, 32))
-    params["language"]["output"] = jnp.zeros((32, VOCAB)).at[:, zero].set(1.0).at[:, zero + 9].set(0.5)
-    grammar = build_answer_grammar(TOKENIZER, 1, "compact")
-    tokens, log_probs = make_decoder(VLA(CONFIG), grammar)({"params": params}, make_prompts())
-    expected = np.zeros((1, 8), int)
-    expected[0, 6] = 9
-    for answer in np.asarray(tokens):
-        np.testing.assert_array_equal(parse_answer(TOKENIZER.decode(answer), 1, "compact"), expected)
-    assert np.isfinite(log_probs).all()
-
-
-def test_a_template_without_free_slots_costs_nothing():
-    tokens, log_probs = decode_actions(VLA(CONFIG), {}, make_prompts(), make_grammar(np.array([4, 5, EOS])))
-    np.testing.assert_array_equal(tokens, np.tile([4, 5, EOS], (3, 1)))
-    assert not log_probs.any()
+    check_padding_and_batch_mates(CONFIG, GRAMMAR, variables, make_prompts(), make_prompts(seed=5), PROMPT_LENGTHS)
 
 
 @pytest.mark.parametrize(
-    ("grammar", "message"),
-    [
-        (Grammar(np.array([-1]), np.ones((1, 7), bool)), "vocabulary of 7 tokens"),
-        (Grammar(np.array([-1]), np.zeros((1, VOCAB), bool)), r"free slots \[0\]"),
-        (Grammar(np.array([-1]), np.ones((2, VOCAB), bool)), "expected forced"),
-    ],
+    ("kind", "arms", "style"),
+    [("words", 2, "compact"), ("sentencepiece", 1, "paper"), ("merged", 1, "paper"), ("sentencepiece", 2, "compact")],
 )
-def test_impossible_grammars_say_why(variables, grammar, message):
-    with pytest.raises(ValueError, match=message):
-        decode_actions(VLA(CONFIG), variables, make_prompts(), grammar)
+def test_random_weights_give_well_formed_actions(kind, arms, style):
+    tokenizer = small_tokenizer(kind)
+    language = dataclasses.replace(CONFIG.language, vocab_size=tokenizer.vocab_size)
+    config = dataclasses.replace(CONFIG, language=language)
+    variables, grammar = random_variables(config), build_answer_grammar(tokenizer, arms, style)
+    decode = make_decoder(VLA(config), grammar)
+    seen = set()
+    for seed in range(3):
+        lengths = np.random.default_rng(seed).integers(1, 10, 50)
+        weights = jax.tree.map(lambda x, s=seed: x * (1.0 + 3 * s), variables)
+        decoded = decode(weights, make_prompts(lengths, seed=seed))
+        assert np.isfinite(decoded.log_probs).all()
+        assert (np.asarray(decoded.entropies) > -1e-5).all()
+        # A choice of signs and digits, at most, is one pass; template tokens and the end are none.
+        assert decoded.passes <= 1 + 8 * arms
+        for integers in np.asarray(decoded.integers):
+            text = tokenizer.decode(grammar.tokens(integers))
+            np.testing.assert_array_equal(parse_answer(text, arms, style), integers)
+            seen.add(format_answer(integers, style))
+    assert len(seen) > 50
+
+
+@pytest.mark.parametrize("choice", ["greedy", "expected", "sample"])
+def test_not_even_broken_weights_give_a_malformed_action(choice: Any):
+    decode = decoder(Decoding(choice))
+    for value in (np.nan, np.inf, -np.inf, 1e30):
+        broken = always(dict.fromkeys(range(VOCAB), value))
+        decoded = decode(broken, make_prompts(), jax.random.key(0))
+        for row in np.asarray(decoded.integers):
+            assert all(value in slot.values for value, slot in zip(row.ravel(), GRAMMAR.slots, strict=True))
+            assert row[0, 3:7].any()
+
+
+def test_a_rotation_of_zeros_never_comes_out():
+    # Numbers 3, 4 and 6 are "0" and number 5 its integer 0: the next best integer of number 6 is 9.
+    zero = always({10: 90.0, 21: 80.0, 4: 80.0, 6: 80.0, 7: 80.0, 19: 60.0})
+    decoded = decoder()(zero, make_prompts())
+    np.testing.assert_array_equal(decoded.integers[:, 0, 3:7], [[0, 0, 0, 9]] * 3)
+    assert np.isfinite(decoded.log_probs).all()
+
+
+def test_expected_is_the_mean_of_the_distribution():
+    # Number 2 is -2, -1, 0, 1 or 2, with weights 4, 0, 1, 3, 3: the best is -2, the mean 1/11.
+    weights = {20 + n: float(np.log(w)) for n, w in enumerate((4.0, 1e-6, 1.0, 3.0, 3.0))}
+    for choice, expected in ((Decoding("greedy"), -2), (Decoding("expected"), 0)):
+        decoded = decoder(choice)(always(weights), make_prompts())
+        assert (np.asarray(decoded.integers[:, 0, 2]) == expected).all()
+    np.testing.assert_allclose(decoded.log_probs[:, 0, 2], np.log(1 / 11), atol=1e-3)
+    p = np.array([4, 1, 3, 3]) / 11
+    np.testing.assert_allclose(decoded.entropies[:, 0, 2], -(p * np.log(p)).sum(), atol=1e-3)
+
+
+def test_samples_follow_the_distribution_and_the_key():
+    decode = decoder(Decoding("sample"))
+    model, prompts = always({20: float(np.log(6.0))}), make_prompts(np.full(400, 9))
+    drawn = decode(model, prompts, jax.random.key(0))
+    # Number 2: -2 with weight 6, four others with weight 1.
+    share = (np.asarray(drawn.integers[:, 0, 2]) == -2).mean()
+    assert abs(share - 0.6) < 4 * np.sqrt(0.6 * 0.4 / 400)
+    np.testing.assert_array_equal(decode(model, prompts, jax.random.key(0)).integers, drawn.integers)
+    assert (np.asarray(decode(model, prompts, jax.random.key(1)).integers) != drawn.integers).any()
+    cold = decoder(Decoding("sample", temperature=0.05))
+    assert (np.asarray(cold(model, prompts, jax.random.key(0)).integers[:, 0, 2]) == -2).all()
+
+
+def test_the_best_of_several_samples_is_kept(variables):
+    prompts, key = make_prompts(), jax.random.key(3)
+    one = decoder(Decoding("sample"))(variables, prompts, key)
+    best = decoder(Decoding("sample", samples=20))(variables, prompts, key)
+    assert (best.log_probs.sum((1, 2)) > one.log_probs.sum((1, 2))).all()
+    assert best.integers.shape == one.integers.shape
+
+
+def test_choosing_says_what_it_needs(variables):
+    with pytest.raises(ValueError, match="give it a key"):
+        decode_actions(VLA(CONFIG), variables, make_prompts(), GRAMMAR, Decoding("sample"))
+    with pytest.raises(ValueError, match="temperature > 0"):
+        Decoding("sample", temperature=0.0)
+    with pytest.raises(ValueError, match="belong to choice 'sample'"):
+        Decoding("greedy", samples=4)
+    small = dataclasses.replace(CONFIG, language=dataclasses.replace(CONFIG.language, vocab_size=30))
+    with pytest.raises(ValueError, match=r"has token 34; the model has 30"):
+        decode_actions(VLA(small), variables, make_prompts(), GRAMMAR)

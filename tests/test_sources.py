@@ -18,8 +18,9 @@ from data_pipelines.vocabulary import Options
 from data_pipelines.vocabulary import main as write_vocabulary
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
-from dsvla_jax.encoding.text import load_tokenizer
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.variables import split_variables
@@ -96,8 +97,9 @@ def test_an_imported_folder_is_learned(folder):
     loader = make_loader(reader, make_sampler(experiment.data, experiment.encoding, tokenizer), batch_size=8, seed=0)
     trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0)), "full")
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    targets = number_rows(tokenizer, "compact").targets(experiment.soft_target_sigma)
     state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
-    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, tokenizer.number_values))
+    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, targets))
     losses = []
     for _ in range(experiment.steps):
         state, metrics = step(state, frozen, next(loader))

@@ -9,16 +9,23 @@ import numpy as np
 import pytest
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.encode import EncodingConfig, encode_text
+from dsvla_jax.encoding.grammar import build_answer_grammar
+from dsvla_jax.encoding.number_targets import NumberTargets, number_rows
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
+from dsvla_jax.encoding.prompts import format_answer, format_prompt
+from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
-from dsvla_jax.training.objective import answer_loss, target_distributions
+from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+from tests.vocabularies import KINDS, small_tokenizer
 
 VOCABULARY = 40
+
+NO_NUMBERS = NumberTargets(np.zeros(1, np.int32), np.full((1, 1), np.inf, np.float32), None, np.zeros(1, bool))
 
 
 def small_experiment(**changes) -> Experiment:
@@ -56,7 +63,7 @@ def random_batch(experiment: Experiment) -> dict[str, np.ndarray]:
         "text_tokens": rng.integers(4, VOCABULARY, (size, text)).astype(np.int32),
         "text_mask": np.ones((size, text), bool),
         "answer_mask": answer,
-        "soft_mask": np.zeros((size, text), bool),
+        "number_rows": np.zeros((size, text), np.int32),
     }
 
 
@@ -65,8 +72,7 @@ def train(experiment: Experiment, steps: int):
     trainable, frozen = split_variables(variables, experiment.regime)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
-    values = np.full(VOCABULARY, np.nan, np.float32)
-    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, values))
+    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, NO_NUMBERS))
     losses = []
     for _ in range(steps):
         state, metrics = step(state, frozen, random_batch(experiment))
@@ -105,10 +111,9 @@ def test_only_answer_tokens_are_learned():
     logits = jnp.asarray(rng.normal(size=(2, 6, 10)), jnp.float32)
     tokens = jnp.asarray(rng.integers(0, 10, (2, 6)))
     answer = jnp.zeros((2, 6), bool).at[:, 4:].set(True)
-    targets = jnp.eye(10)
 
     def loss(logits):
-        return answer_loss(logits, tokens, answer, jnp.zeros_like(answer), targets)[0]
+        return answer_loss(logits, tokens, answer, jnp.zeros_like(tokens), NO_NUMBERS)[0]
 
     gradient = np.abs(np.asarray(jax.grad(loss)(logits))).sum(-1)
     assert (gradient[:, 3:5] > 0).all(), "positions 3 and 4 predict the answer tokens 4 and 5"
@@ -116,20 +121,60 @@ def test_only_answer_tokens_are_learned():
     probabilities = np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)
     expected = -np.mean([np.log(probabilities[b, t - 1, tokens[b, t]]) for b in range(2) for t in (4, 5)])
     np.testing.assert_allclose(loss(logits), expected, rtol=1e-5)
-    plain = answer_loss(logits, tokens, answer, answer, None)[0]
-    np.testing.assert_allclose(plain, answer_loss(logits, tokens, answer, answer, targets)[0], rtol=1e-6)
 
 
-def test_soft_targets_spread_over_neighbouring_integers_only():
-    values = np.array([np.nan, np.nan, *range(-3, 4)], np.float32)
-    targets = target_distributions(values, 1.0)
-    assert targets is not None
-    np.testing.assert_allclose(targets.sum(1), 1, rtol=1e-6)
-    assert targets[5].argmax() == 5
-    np.testing.assert_allclose(targets[5, 6] / targets[5, 5], np.exp(-0.5), rtol=1e-6)
-    assert (targets[5, :2] == 0).all()
-    np.testing.assert_array_equal(targets[0], np.eye(9)[0])
-    assert target_distributions(values, 0.0) is None
+def number_example(tokenizer: Tokenizer, guess: list[list[int]], sigma: float = 0.0):
+    """The loss's metrics where the answer is [[12, -7, 140, 0, 99, 0, 7, 1]] and each token is predicted as `guess`."""
+    truth = np.array([[12, -7, 140, 0, 99, 0, 7, 1]])
+    numbers = number_rows(tokenizer, "paper")
+    prompt = format_prompt("lift", truth, None, "paper")
+    tokens, _, answer = encode_text(tokenizer, prompt, format_answer(truth, "paper"), 400)
+    rows = np.zeros(400, np.int32)
+    rows[answer] = numbers.rows(truth)
+    predicted = encode_text(tokenizer, prompt, format_answer(np.array(guess), "paper"), 400)[0]
+    logits = 50.0 * jax.nn.one_hot(np.roll(predicted, -1), tokenizer.vocab_size)
+    logits, tokens, answer, rows = (jnp.asarray(x)[None] for x in (logits, tokens, answer, rows))
+    return {k: float(v) for k, v in answer_loss(logits, tokens, answer, rows, numbers.targets(sigma))[1].items()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bins_within_one_are_counted_number_by_number(kind):
+    tokenizer = small_tokenizer(kind)
+    assert number_example(tokenizer, [[12, -7, 140, 0, 99, 0, 7, 1]])["bin_within_one"] == 1
+    # One off in the last digit; the status is not a bin; of the 7 bins one is five off, and one of the wrong sign.
+    assert number_example(tokenizer, [[13, -7, 141, 0, 98, 0, 7, 0]])["bin_within_one"] == 1
+    np.testing.assert_allclose(number_example(tokenizer, [[17, -7, 140, 0, 99, 0, 7, 1]])["bin_within_one"], 6 / 7)
+    np.testing.assert_allclose(number_example(tokenizer, [[12, 7, 145, 0, 99, 0, 7, 1]])["bin_within_one"], 5 / 7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_soft_targets_are_the_probabilities_of_nearby_bins(kind):
+    """Along a number's tokens, the distributions to learn multiply to the Gaussian over its slot's bins."""
+    tokenizer, sigma = small_tokenizer(kind), 1.5
+    numbers, grammar = number_rows(tokenizer, "paper"), build_answer_grammar(tokenizer, 1, "paper")
+    targets, slot = numbers.targets(sigma), grammar.slots[0]
+    assert targets.weights is not None
+    truth = np.array([[139, 0, 0, 0, 0, 0, 100, 1]])
+    first = len(grammar.templates[0])
+    rows = numbers.rows(truth)[first : first + len(slot.tokens[139 + 100])]
+    values = np.arange(-100, 201)
+    gaussian = np.exp(-0.5 * ((values - 139) / sigma) ** 2)
+    path = slot.tokens[139 + 100]
+    for place, row in enumerate(rows):
+        under = [tokens[:place] == path[:place] and len(tokens) > place for tokens in slot.tokens]
+        offered = {tokens[place] for tokens, inside in zip(slot.tokens, under, strict=True) if inside}
+        if len(offered) == 1:
+            assert row == 0
+            continue
+        for token in offered:
+            leads = [inside and t[place] == token for t, inside in zip(slot.tokens, under, strict=True)]
+            expected = gaussian[leads].sum() / gaussian[under].sum()
+            weight = targets.weights[row, list(targets.tokens).index(token)]
+            np.testing.assert_allclose(weight, expected, rtol=1e-5, atol=1e-30)
+        np.testing.assert_allclose(targets.weights[row].sum(), 1, rtol=1e-6)
+    assert numbers.rows(truth)[-2:].tolist() == [0, 0], "neither status, full stop nor end"
+    soft, hard = (number_example(tokenizer, [[12, -7, 140, 0, 99, 0, 7, 1]], s)["loss"] for s in (sigma, 0.0))
+    assert hard < 1e-3 < soft
 
 
 def test_checkpoint_resumes_training_exactly(tmp_path: Path):

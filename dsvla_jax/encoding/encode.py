@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from dsvla_jax.encoding.alignment import AlignmentMode, align_to_patches
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.farthest_point import farthest_point_sample
+from dsvla_jax.encoding.grammar import tokenize_answer
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig, tokenize_points
 from dsvla_jax.encoding.prompts import Style, format_prompt
@@ -138,7 +139,7 @@ def encode_text(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Prompt and answer as padded tokens, on the host.
 
-    Prompt and answer are tokenised apart, so a prompt's tokens never depend on its answer.
+    The prompt's tokens do not depend on its answer; raises UserError where the tokenizer would make them.
 
     Args:
         answer: None at inference; then the text ends with the prompt, without the end-of-sequence token.
@@ -147,10 +148,13 @@ def encode_text(
         tokens: int32 (T,), begin, prompt [, answer, end], padding. mask: bool (T,), False on padding.
         answer_mask: bool (T,), True on the answer's tokens and its end: what the policy is to write.
     """
-    tokens = [tokenizer.bos_id, *tokenizer.encode(prompt)]
-    start = len(tokens)
-    if answer is not None:
-        tokens += [*tokenizer.encode(answer), tokenizer.eos_id]
+    if answer is None:
+        asked, answered = tokenizer.encode(prompt), []
+    else:
+        asked, answered = tokenize_answer(tokenizer, prompt, answer)
+        answered = [*answered, tokenizer.eos_id]
+    start = 1 + len(asked)
+    tokens = [tokenizer.bos_id, *asked, *answered]
     length = len(tokens)
     if length > max_length:
         raise ValueError(

@@ -4,8 +4,8 @@ Two styles:
     paper    the sentences of 3DS-VLA in the Alpaca wrapper its language model was tuned with.
     compact  words and integers only, for policies small enough to train on a CPU.
 
-Integers are those of ``codec.PoseCodec``. The left arm comes first. A prompt ends in ":" and the answer is tokenised
-after it on its own, so the prompt's tokens are a prefix of the prompt and answer's tokens.
+Integers are those of ``codec.PoseCodec``. The left arm comes first. A prompt ends in ":", and the answer follows after
+a space (``grammar.tokenize_answer``).
 """
 
 import dataclasses

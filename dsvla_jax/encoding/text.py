@@ -1,4 +1,4 @@
-"""Text to tokens: the tokenizer interface, a small word-level tokenizer, and the grammar of answers over tokens."""
+"""Text to tokens: the tokenizer interface, and a small word-level tokenizer."""
 
 import dataclasses
 import functools
@@ -9,12 +9,8 @@ from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 import numpy as np
-from flax import struct
 
-from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
-from dsvla_jax.encoding.prompts import Slot, Style, answer_pieces, template_texts
-from dsvla_jax.errors import UserError
-from dsvla_jax.types import Array
+from dsvla_jax.encoding.prompts import template_texts
 
 LOWEST_NUMBER, HIGHEST_NUMBER = -100, 200
 _SPECIAL = ("<pad>", "<unk>", "<s>", "</s>")
@@ -22,7 +18,11 @@ _FILE_FORMAT = "dsvla_jax word tokenizer 1"
 
 
 class Tokenizer(Protocol):
-    """What the policy asks of a tokenizer. ``encode`` adds no special tokens; ``decode`` leaves them out."""
+    """What the policy asks of a tokenizer. Hashable, equal where the vocabulary is.
+
+    ``encode`` adds no special tokens; ``decode`` leaves them out. ``save`` writes a folder that
+    ``pretrained_tokenizers.load_tokenizer`` reads.
+    """
 
     @property
     def vocab_size(self) -> int: ...
@@ -40,19 +40,12 @@ class Tokenizer(Protocol):
 
     def decode(self, tokens: Sequence[int]) -> str: ...
 
+    @property
+    def number_values(self) -> np.ndarray | None:
+        """float32 (V,): the value of each token that is an integer of its own, NaN elsewhere; None for none."""
+        ...
 
-def load_tokenizer(folder: str | pathlib.Path) -> "WordTokenizer":
-    """The tokenizer saved in a folder as tokenizer.json; raises UserError where there is none that can be read."""
-    file = pathlib.Path(folder) / "tokenizer.json"
-    if not file.exists():
-        raise UserError(
-            f"tokenizer: {file} is missing; expected the vocabulary that the language model was trained with: put it "
-            "there, or name its folder with --tokenizer"
-        )
-    try:
-        return WordTokenizer.load(file)
-    except ValueError as error:
-        raise UserError(f"tokenizer: {error}") from error
+    def save(self, folder: pathlib.Path) -> None: ...
 
 
 def split_words(text: str) -> list[str]:
@@ -120,20 +113,21 @@ class WordTokenizer:
         return values
 
     def encode(self, text: str) -> list[int]:
-        return [self._encode_word(word, text) for word in split_words(text)]
+        ids = self._ids
+        return [ids[word] if word in ids else self._encode_word(word, text) for word in split_words(text)]
 
     def decode(self, tokens: Sequence[int]) -> str:
         special = (self.pad_id, self.bos_id, self.eos_id)
         return " ".join(self.pieces[int(token)] for token in tokens if int(token) not in special)
 
-    def save(self, path: str | pathlib.Path) -> None:
-        """Writes the words as JSON."""
+    def save(self, folder: pathlib.Path) -> None:
+        """Writes the words as JSON, in the folder's tokenizer.json."""
         content = {"format": _FILE_FORMAT, "words": list(self.words)}
-        pathlib.Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        (folder / "tokenizer.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | pathlib.Path) -> "WordTokenizer":
-        """Reads what ``save`` wrote."""
+        """Reads the file that ``save`` wrote."""
         try:
             content = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
         except json.JSONDecodeError as error:
@@ -146,73 +140,13 @@ class WordTokenizer:
 
     def _encode_word(self, word: str, text: str) -> int:
         if not _is_number(word):
-            return self._ids.get(word, self.unk_id)
+            return self.unk_id
         number = str(int(word))
         if number not in self._ids:
             raise ValueError(
                 f"number {word} has no token: integers from {LOWEST_NUMBER} to {HIGHEST_NUMBER} have one; in {text!r}"
             )
         return self._ids[number]
-
-
-@struct.dataclass
-class AnswerGrammar:
-    """Which tokens an answer may have at each of its L places; the end-of-sequence token is the last place.
-
-    forced: int32 (L,), the only possible token, or -1 where the policy chooses.
-    allowed: bool (L, V), True for the tokens that may stand there (one-hot where forced).
-    forbidden: int32 (A, L), combinations that no answer has: for each arm the tokens of a quaternion of four zeros,
-        which is no rotation; -1 at the other places.
-    """
-
-    forced: np.ndarray | Array
-    allowed: np.ndarray | Array
-    forbidden: np.ndarray | Array
-
-
-def build_answer_grammar(tokenizer: Tokenizer, num_arms: int, style: Style) -> AnswerGrammar:
-    """The grammar of ``prompts.answer_pieces`` over a tokenizer's tokens, for constrained decoding.
-
-    Raises:
-        ValueError: an integer of some slot is more than one token, so a slot would not be one place.
-    """
-    numbers: dict[int, int] = {}
-    forced: list[int] = []
-    choices: list[list[int]] = []
-    for piece in answer_pieces(num_arms, style):
-        if isinstance(piece, Slot):
-            slot_tokens = []
-            for number in range(piece.low, piece.high + 1):
-                if number not in numbers:
-                    numbers[number] = _single_token(tokenizer, number)
-                slot_tokens.append(numbers[number])
-            forced.append(-1)
-            choices.append(slot_tokens)
-        else:
-            tokens = tokenizer.encode(piece)
-            forced += tokens
-            choices += [[token] for token in tokens]
-    forced.append(tokenizer.eos_id)
-    choices.append([tokenizer.eos_id])
-    allowed = np.zeros((len(forced), tokenizer.vocab_size), bool)
-    for place, tokens in enumerate(choices):
-        allowed[place, tokens] = True
-    # NumPy's, not JAX's: the form of an answer must stay concrete when this is called inside a jitted function.
-    free = np.flatnonzero(np.asarray(forced) < 0).reshape(num_arms, VALUES_PER_ARM)
-    forbidden = np.full((num_arms, len(forced)), -1, np.int32)
-    for arm, places in enumerate(free):
-        forbidden[arm, places[QUATERNION_VALUES]] = numbers[0]
-    return AnswerGrammar(forced=np.asarray(forced, np.int32), allowed=allowed, forbidden=forbidden)
-
-
-def _single_token(tokenizer: Tokenizer, number: int) -> int:
-    tokens = tokenizer.encode(str(number))
-    if len(tokens) != 1:
-        raise ValueError(
-            f"answer grammar: expected one token for each integer, but {number} is {len(tokens)} tokens; "
-            "use a tokenizer with integer tokens, such as WordTokenizer"
-        )
-    return tokens[0]
 
 
 def _is_number(word: str) -> bool:

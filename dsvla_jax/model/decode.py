@@ -1,137 +1,311 @@
 """Decoding of actions that cannot be malformed.
 
-The answer's form is known beforehand: a template of forced tokens with free slots, each slot restricted to the tokens
-that its grammar allows. The prompt is read once into a key/value cache; then each free slot costs one sequential pass,
-which reads the chosen token together with the template tokens that follow it. Greedy, hence deterministic.
+The answer's form is known beforehand: fixed templates with a number in between. The prompt is read once into a
+key/value cache. Then every number costs one pass, whatever its tokens: the pass reads the number before it, the
+template between the two, and the tree of the number's own integers (``number_tree``), and gives the probability of
+each integer that the slot admits. docs/decoding.md has the picture.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Literal
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
+from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
+from dsvla_jax.encoding.grammar import AnswerGrammar
 from dsvla_jax.model.llama import KVCache
+from dsvla_jax.model.number_tree import (
+    Branches,
+    Numbers,
+    NumberTree,
+    log_probabilities,
+    number_tree,
+    stack_choices,
+    stack_numbers,
+)
 from dsvla_jax.model.vla import VLA
-from dsvla_jax.types import ModelInputs
-
-Array = jax.Array
+from dsvla_jax.types import Array, ModelInputs
 
 
-class Grammar(Protocol):
-    """The form of an answer, as ``dsvla_jax.encoding.text.build_answer_grammar`` makes it.
+@dataclasses.dataclass(frozen=True)
+class Decoding:
+    """How integers are chosen from their distributions.
 
-    forced: int32 (L,), the template's token, -1 where the slot is free. allowed: bool (L, V), read at free slots.
-    forbidden, optional: int32 (R, L), combinations that must not come out, such as a quaternion of four zeros. A row
-        holds tokens at free slots and -1 elsewhere; an answer never has all the tokens of a row.
+    Attributes:
+        choice: `greedy` takes the most probable integer of each slot; `expected` the one nearest to the mean of the
+            slot's distribution; `sample` draws.
+        temperature: of `sample`: the distributions are raised to its inverse.
+        samples: of `sample`: so many answers are drawn, and the most probable one is kept.
     """
 
-    @property
-    def forced(self) -> Any: ...
-    @property
-    def allowed(self) -> Any: ...
+    choice: Literal["greedy", "expected", "sample"] = "greedy"
+    temperature: float = 1.0
+    samples: int = 1
+
+    def __post_init__(self):
+        if self.temperature <= 0 or self.samples < 1:
+            raise ValueError(f"Decoding: expected temperature > 0 and samples >= 1, got {self}")
+        if self.choice != "sample" and (self.temperature, self.samples) != (1.0, 1):
+            raise ValueError(f"Decoding: temperature and samples belong to choice 'sample', not to {self.choice!r}")
 
 
-def decode_actions(model: VLA, variables: Any, inputs: ModelInputs, grammar: Grammar) -> tuple[Array, Array]:
-    """Greedy answers of a batch: tokens int32 (B, L) and their log-probabilities float32 (B, L).
+GREEDY = Decoding()
+
+
+@struct.dataclass
+class Decoded:
+    """The answers of a batch.
+
+    integers: int32 (B, A, 8), as ``PoseCodec.decode`` takes them. log_probs: float32 (B, A, 8), of each among the
+    integers that its slot admits. entropies: float32 (B, A, 8), nats, of the slots' distributions: how unsure the
+    policy was. passes: how often the language model was run one after the other, the prompt's pass included.
+    """
+
+    integers: Array
+    log_probs: Array
+    entropies: Array
+    passes: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class _Written:
+    """The answer as far as it goes: integers int32 (B, K), log_probs and entropies float32 (B, K)."""
+
+    integers: Array
+    log_probs: Array
+    entropies: Array
+
+
+@struct.dataclass
+class _Read:
+    """What the language model has read: its cache, valid bool (B, S) where that holds a token, lengths int32 (B,)."""
+
+    cache: KVCache
+    valid: Array
+    lengths: Array
+
+
+@struct.dataclass
+class _Pass:
+    """What one pass reads, and how it leads to the number of a slot.
+
+    slot: int32 (), which. offset: where in the cache it writes. before: the numbers of the slot before, of which it
+    reads the chosen one. template: int32 (C,). tree: of the number to come.
+    """
+
+    slot: Any
+    offset: int | np.ndarray | Array
+    before: Numbers
+    template: np.ndarray | Array
+    tree: NumberTree
+
+    def shape(self) -> tuple[int, ...]:
+        return self.before.tokens.shape[1], len(self.template), len(self.tree.branches.tokens)
+
+
+def decode_actions(
+    model: VLA,
+    variables: Any,
+    inputs: ModelInputs,
+    grammar: AnswerGrammar,
+    decoding: Decoding = GREEDY,
+    key: Array | None = None,
+) -> Decoded:
+    """The answers of a batch. Under ``jax.jit``, close over the model, grammar and decoding (see ``make_decoder``).
 
     inputs: batched, the text being prompts without answers, padded at the end to one length; padding and the other
         examples of the batch have no influence on an answer.
-    grammar: concrete arrays, since its template decides the shape of the computation; close over it under ``jax.jit``
-        (``make_decoder`` does).
-    A log-probability is that among the allowed tokens of the slot; it is 0 for forced tokens.
+    key: for `sample`; an example draws by its place in the batch.
     """
-    forced, allowed, forbidden = _concrete(grammar)
-    length = forced.shape[0]
-    batch = inputs.text_tokens.shape[0]
-    answer = jnp.broadcast_to(jnp.asarray(forced), (batch, length))
-    log_probs = jnp.zeros((batch, length), jnp.float32)
-    free = np.flatnonzero(forced < 0)
-    if free.size == 0:
-        return answer, log_probs
-    if allowed.shape[1] != model.config.language.vocab_size:
+    _check_vocabulary(grammar, model.config.language.vocab_size)
+    if decoding.choice == "sample" and key is None:
+        raise ValueError("decode_actions: choice 'sample' draws integers; give it a key")
+    trees = [number_tree(slot) for slot in grammar.slots]
+    # What precedes the first number is read with the prompt; behind the last number nothing is read.
+    inputs = _append(inputs, np.array(grammar.templates[0], np.int32))
+    templates = [np.array(template, np.int32) for template in grammar.templates[1:-1]]
+    # Number and template keep their places in the cache; those of a tree are used again by the next pass.
+    kept = [tree.numbers.tokens.shape[1] + len(template) for tree, template in zip(trees, templates, strict=False)]
+    offsets = np.cumsum([0, *kept])
+    room = max(offset + len(tree.branches.tokens) for offset, tree in zip(offsets, trees, strict=True))
+
+    prefilled: Any = model.apply(variables, inputs, int(room), method="prefill")
+    root, cache = prefilled
+    before = cache.keys.shape[3] - room
+    lengths = before - inputs.text_tokens.shape[1] + inputs.text_mask.sum(axis=1).astype(jnp.int32)
+    if decoding.samples > 1:
+        root, cache, lengths = _repeat((root, cache, lengths), decoding.samples)
+    batch = len(lengths)
+    keys = None if key is None else jax.vmap(lambda b: jax.random.fold_in(key, b))(jnp.arange(batch))
+    read = _Read(cache, jnp.arange(cache.keys.shape[3]) < lengths[:, None], lengths)
+    written = _Written(*(jnp.zeros((batch, len(trees)), dtype) for dtype in (jnp.int32, jnp.float32, jnp.float32)))
+
+    def choose(written: _Written, slot: int | Array, hidden: Array, tree: NumberTree) -> _Written:
+        logits: Any = model.apply(variables, hidden, tree.choices.tokens, method="lm_head")
+        log_probs = _admitted(log_probabilities(logits, tree.choices), written, slot, tree.numbers)
+        index = _choose(log_probs, tree.numbers, decoding, keys, slot)[:, None]
+        entropy = -jnp.where(jnp.isfinite(log_probs), jnp.exp(log_probs) * log_probs, 0.0).sum(axis=-1)
+        return _Written(
+            written.integers.at[:, slot].set(jnp.asarray(tree.numbers.values)[index[:, 0]]),
+            written.log_probs.at[:, slot].set(jnp.take_along_axis(log_probs, index, axis=1)[:, 0]),
+            written.entropies.at[:, slot].set(entropy),
+        )
+
+    def run(carry: tuple[_Read, _Written], one: _Pass) -> tuple[tuple[_Read, _Written], None]:
+        read, written = carry
+        row = written.integers[:, one.slot - 1] - jnp.asarray(one.before.values)[0]
+        number, length = jnp.asarray(one.before.tokens)[row], jnp.asarray(one.before.lengths)[row]
+        index, branches = before + one.offset, one.tree.branches
+        x, read = _extend(model, variables, read, index, number, length, one.template, branches)
+        trunk = number.shape[1] + len(one.template)
+        last = jnp.where(len(one.template) > 0, trunk, length) - 1
+        root = jnp.take_along_axis(x, last[:, None, None], axis=1)
+        written = choose(written, one.slot, jnp.concatenate([root, x[:, trunk:]], axis=1), one.tree)
+        return (read, written), None
+
+    passes, hidden = 1, root[:, None]
+    if len(trees[0].branches.tokens):
+        nothing = jnp.zeros((batch, 0), jnp.int32), jnp.zeros(batch, jnp.int32), np.zeros(0, np.int32)
+        x, read = _extend(model, variables, read, before, *nothing, trees[0].branches)
+        passes, hidden = passes + 1, jnp.concatenate([hidden, x], axis=1)
+    carry = read, choose(written, 0, hidden, trees[0])
+    following = [
+        _Pass(slot, offset, trees[slot - 1].numbers, template, trees[slot])
+        for slot, offset, template in zip(range(1, len(trees)), offsets, templates, strict=False)
+    ]
+    # Neighbouring passes of one shape run as one loop, so that compile time does not grow with them.
+    for _, alike in itertools.groupby(following, _Pass.shape):
+        group = list(alike)
+        carry, _ = jax.lax.scan(run, carry, _stack(group))
+        passes += len(group)
+    written = carry[1]
+    if decoding.samples > 1:
+        written = _most_probable(written, decoding.samples)
+    arms = (-1, grammar.num_arms, VALUES_PER_ARM)
+    return Decoded(
+        written.integers.reshape(arms), written.log_probs.reshape(arms), written.entropies.reshape(arms), passes
+    )
+
+
+def make_decoder(model: VLA, grammar: AnswerGrammar, decoding: Decoding = GREEDY) -> Callable[..., Decoded]:
+    """A jitted ``(variables, inputs, key=None) -> Decoded`` for one grammar; only `sample` needs a key."""
+    return jax.jit(lambda variables, inputs, key=None: decode_actions(model, variables, inputs, grammar, decoding, key))
+
+
+def _extend(
+    model: VLA,
+    variables: Any,
+    read: _Read,
+    index: int | Array,
+    number: Array,
+    length: Array,
+    template: np.ndarray | Array,
+    branches: Branches,
+) -> tuple[Array, _Read]:
+    """Reads a number (B, W), of which the first ``length`` (B,) tokens count, a template and a tree's branches.
+
+    They are written at ``index`` of the cache. Returns the hidden states (B, W + C + F, width), and what has been read:
+    number and template, the branches having served.
+    """
+    batch, width = number.shape
+    trunk = width + len(template)
+    tokens = jnp.concatenate([jnp.asarray(template), jnp.asarray(branches.tokens)])
+    tokens = jnp.concatenate([number, jnp.broadcast_to(tokens, (batch, len(tokens)))], axis=1)
+    # Positions behind the text so far: a short number leaves places of the cache empty, but no gap in positions.
+    behind = jnp.concatenate([jnp.arange(len(template)), len(template) - 1 + jnp.asarray(branches.depths)])
+    behind = jnp.concatenate(
+        [jnp.broadcast_to(jnp.arange(width), (batch, width)), length[:, None] + behind.astype(jnp.int32)], axis=1
+    )
+    counts = (jnp.arange(trunk) < length[:, None]) | (jnp.arange(trunk) >= width)
+    earlier = jnp.arange(tokens.shape[1])[:, None] >= jnp.arange(trunk)
+    sees = jnp.pad(jnp.asarray(branches.sees), ((trunk, 0), (0, 0)))
+    among = jnp.concatenate(
+        [earlier & counts[:, None, :], jnp.broadcast_to(sees, (batch, *sees.shape))], axis=-1
+    )  # (B, W + C + F, W + C + F)
+    mask = jnp.broadcast_to(read.valid[:, None], (*tokens.shape, read.valid.shape[1]))
+    mask = jax.lax.dynamic_update_slice_in_dim(mask, among, index, axis=2)
+    extended: Any = model.apply(
+        variables, tokens, read.lengths[:, None] + behind, mask, read.cache, index, method="extend"
+    )
+    x, cache = extended
+    valid = jax.lax.dynamic_update_slice_in_dim(read.valid, counts, index, axis=1)
+    return x, _Read(cache, valid, read.lengths + length + len(template))
+
+
+def _admitted(log_probs: Array, written: _Written, slot: int | Array, numbers: Numbers) -> Array:
+    """Distributions (B, N) over integers, minus infinity exactly where none may be chosen, whatever the logits were.
+
+    Besides rows that are no integer, that is 0 for the last part of a quaternion whose other parts are 0, which would
+    be no rotation.
+    """
+    last, others = QUATERNION_VALUES.stop - 1, QUATERNION_VALUES.stop - 1 - QUATERNION_VALUES.start
+    first = jnp.maximum(slot - others, 0)
+    zeros = (jax.lax.dynamic_slice_in_dim(written.integers, first, others, axis=1) == 0).all(axis=1)
+    refused = (jnp.asarray(slot) % VALUES_PER_ARM == last) & zeros[:, None] & (jnp.asarray(numbers.values) == 0)
+    admitted = (jnp.asarray(numbers.lengths) > 0) & ~refused
+    return jnp.where(admitted, jax.nn.log_softmax(jnp.where(admitted, log_probs, -jnp.inf), axis=-1), -jnp.inf)
+
+
+def _choose(log_probs: Array, numbers: Numbers, decoding: Decoding, keys: Array | None, slot: int | Array) -> Array:
+    """int32 (B,): rows of ``numbers``, never one of log-probability minus infinity."""
+    if decoding.choice == "expected":
+        values = jnp.asarray(numbers.values)
+        mean = (jnp.exp(log_probs) * values).sum(axis=-1, keepdims=True)
+        return jnp.where(jnp.isneginf(log_probs), jnp.inf, jnp.abs(values - mean)).argmin(axis=-1)
+    if decoding.choice == "sample":
+        draw = jax.vmap(lambda key, row: jax.random.categorical(jax.random.fold_in(key, slot), row))
+        return draw(keys, log_probs / decoding.temperature)
+    return log_probs.argmax(axis=-1)
+
+
+def _stack(group: list[_Pass]) -> _Pass:
+    """Passes of one shape in arrays with an axis in front."""
+    branches: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *(one.tree.branches for one in group))
+    return _Pass(
+        slot=np.array([one.slot for one in group], np.int32),
+        offset=np.array([one.offset for one in group], np.int32),
+        before=stack_numbers([one.before for one in group]),
+        template=np.stack([one.template for one in group]),
+        tree=NumberTree(
+            branches,
+            stack_choices([one.tree.choices for one in group]),
+            stack_numbers([one.tree.numbers for one in group]),
+        ),
+    )
+
+
+def _repeat(tree: Any, times: int) -> Any:
+    """Every example ``times`` times, side by side; (root, cache, lengths), of which the cache's axis 1 is the batch."""
+    root, cache, lengths = tree
+    prompt = cache.prompt
+    if prompt is not None:
+        prompt = prompt.replace(
+            keys=jnp.repeat(prompt.keys, times, axis=1), values=jnp.repeat(prompt.values, times, axis=1)
+        )
+    cache = KVCache(jnp.repeat(cache.keys, times, axis=1), jnp.repeat(cache.values, times, axis=1), prompt)
+    return jnp.repeat(root, times, axis=0), cache, jnp.repeat(lengths, times, axis=0)
+
+
+def _most_probable(written: _Written, samples: int) -> _Written:
+    """Of each example's samples the one of highest probability."""
+    best = written.log_probs.sum(axis=1).reshape(-1, samples).argmax(axis=1)
+    rows = jnp.arange(len(best)) * samples + best
+    return jax.tree.map(lambda leaf: leaf[rows], written)
+
+
+def _check_vocabulary(grammar: AnswerGrammar, vocab_size: int) -> None:
+    numbers = (token for slot in grammar.slots for tokens in slot.tokens for token in tokens)
+    largest = max(itertools.chain(numbers, *grammar.templates))
+    if largest >= vocab_size:
         raise ValueError(
-            f"grammar: made for a vocabulary of {allowed.shape[1]} tokens, the model has "
-            f"{model.config.language.vocab_size}; build both from one tokenizer"
+            f"grammar: made for another vocabulary, in which an answer has token {largest}; the model has {vocab_size} "
+            "tokens. Build both from one tokenizer"
         )
-
-    lead = int(free[0])
-    fed = int(free[-1]) - lead  # the answer's tokens that are ever read
-    prompt = _append(inputs, forced[:lead])
-    prefilled: Any = model.apply(variables, prompt, fed, method="prefill")
-    logits, cache = prefilled
-    slots = jnp.arange(cache.keys.shape[3])
-    start = cache.keys.shape[3] - fed
-    visual_tokens = start - prompt.text_tokens.shape[1]
-    prompt_lengths = visual_tokens + prompt.text_mask.sum(axis=1).astype(jnp.int32)
-    in_prompt = slots[None, :] < prompt_lengths[:, None]
-
-    def choose(logits: Array, answer: Array, place: Array | int) -> tuple[Array, Array]:
-        permitted = jnp.asarray(allowed)[place] & ~_completes(jnp.asarray(forbidden), answer, place, allowed.shape[1])
-        logits = jnp.where(permitted, logits, -jnp.inf)
-        token = jnp.argmax(logits, axis=-1).astype(jnp.int32)
-        log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), token[:, None], axis=-1)[:, 0]
-        return answer.at[:, place].set(token), log_prob
-
-    def fill_place(carry: tuple[Array, KVCache, Array], xs: tuple[Array, Array]) -> tuple[Any, Array]:
-        logits, cache, answer = carry
-        places, offset = xs
-        answer, log_prob = choose(logits, answer, places[0])
-        # Answer tokens share their slots across the batch, behind the longest prompt; positions are each example's.
-        steps = offset + jnp.arange(places.shape[0])
-        in_answer = (slots >= start) & (slots[None, :] <= start + steps[:, None])
-        mask = in_prompt[:, None, :] | in_answer[None]
-        positions = prompt_lengths[:, None] + steps[None]
-        extended: Any = model.apply(
-            variables, answer[:, places], positions, mask, cache, start + offset, method="extend"
-        )
-        return (*extended, answer), log_prob
-
-    # Free places followed by equally many template tokens run as one loop, so that compile time does not grow with
-    # them. Each iteration reads the place's token together with the template tokens that follow it.
-    free_log_probs = []
-    for first, count, width in _runs(free):
-        places = first + np.arange(count * width).reshape(count, width)
-        xs = (jnp.asarray(places), jnp.asarray(places[:, 0] - lead))
-        (logits, cache, answer), run_log_probs = jax.lax.scan(fill_place, (logits, cache, answer), xs)
-        free_log_probs.append(run_log_probs.T)
-    answer, log_prob = choose(logits, answer, int(free[-1]))
-    free_log_probs.append(log_prob[:, None])
-    return answer, log_probs.at[:, free].set(jnp.concatenate(free_log_probs, axis=1))
-
-
-def make_decoder(model: VLA, grammar: Grammar) -> Callable[[Any, ModelInputs], tuple[Array, Array]]:
-    """A jitted ``(variables, inputs) -> tokens, log_probs`` for one grammar."""
-    return jax.jit(lambda variables, inputs: decode_actions(model, variables, inputs, grammar))
-
-
-def _concrete(grammar: Grammar) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in (grammar.forced, grammar.allowed)):
-        raise TypeError(
-            "grammar: got traced arrays; its template decides the shape of the computation, so close over the grammar "
-            "instead of passing it through jax.jit (see make_decoder)"
-        )
-    forced, allowed = np.asarray(grammar.forced, np.int32), np.asarray(grammar.allowed, bool)
-    if forced.ndim != 1 or allowed.ndim != 2 or allowed.shape[0] != forced.shape[0]:
-        raise ValueError(f"grammar: expected forced (L,) and allowed (L, V), got {forced.shape} and {allowed.shape}")
-    empty = np.flatnonzero((forced < 0) & ~allowed.any(axis=1))
-    if empty.size:
-        raise ValueError(f"grammar: free slots {empty.tolist()} allow no token at all")
-    forbidden = np.asarray(getattr(grammar, "forbidden", np.zeros((0, len(forced)))), np.int32)
-    if forbidden.ndim != 2 or forbidden.shape[1] != len(forced):
-        raise ValueError(f"grammar: expected forbidden (R, {len(forced)}), got {forbidden.shape}")
-    return forced, allowed, forbidden
-
-
-def _completes(forbidden: Array, answer: Array, place: Array | int, vocab_size: int) -> Array:
-    """bool (B, V): the tokens which at ``place`` would complete a forbidden combination. Later places are still -1."""
-    tokens = forbidden[:, place]
-    matches = (forbidden[None] < 0) | (forbidden[None] == answer[:, None])  # (B, R, L)
-    complete = matches.at[:, :, place].set(True).all(axis=-1) & (tokens >= 0)
-    return (complete[:, :, None] & (tokens[:, None] == jnp.arange(vocab_size))).any(axis=1)
 
 
 def _append(inputs: ModelInputs, tokens: np.ndarray) -> ModelInputs:
@@ -143,15 +317,3 @@ def _append(inputs: ModelInputs, tokens: np.ndarray) -> ModelInputs:
     behind = jnp.arange(text.shape[1])[None] - inputs.text_mask.sum(axis=1, keepdims=True)
     text = jnp.where((behind >= 0) & (behind < count), jnp.asarray(tokens)[jnp.clip(behind, 0, count - 1)], text)
     return dataclasses.replace(inputs, text_tokens=text, text_mask=behind < count)
-
-
-def _runs(free: np.ndarray) -> list[tuple[int, int, int]]:
-    """(first slot, slots, distance between slots) of each run of equally spaced free slots; not the last slot."""
-    runs: list[tuple[int, int, int]] = []
-    for slot, width in zip(free[:-1].tolist(), np.diff(free).tolist(), strict=True):
-        if runs and runs[-1][2] == width:
-            first, count, _ = runs.pop()
-            runs.append((first, count + 1, width))
-        else:
-            runs.append((slot, 1, width))
-    return runs

@@ -216,13 +216,16 @@ class Llama(nn.Module):
             cache = KVCache(text.keys, text.values, cached)
         return self.norm(x).astype(self.config.compute_dtype), cache
 
-    def lm_head(self, hidden: Array) -> Array:
-        """(..., width) -> float32 logits (..., V)."""
+    def lm_head(self, hidden: Array, tokens: np.ndarray | Array | None = None) -> Array:
+        """(..., width) -> float32 logits (..., V), or those of ``tokens`` (U,) alone, (..., U)."""
         language, dtype = self.config.language, self.config.compute_dtype
         table, axis = (self.embedding, 1) if language.tie_embeddings else (self.output, 0)
+        if tokens is not None:
+            table = jnp.take(table, jnp.asarray(tokens), axis=1 - axis)
         flat = hidden.reshape(-1, language.width).astype(dtype)
         logits = jax.lax.dot_general(
             flat, table.astype(dtype), (((1,), (axis,)), ((), ())), preferred_element_type=jnp.float32
         )
-        logits = logits.reshape(*hidden.shape[:-1], language.vocab_size)
-        return constrain(logits, "batch", *(None,) * (logits.ndim - 2), "vocab")
+        logits = logits.reshape(*hidden.shape[:-1], -1)
+        # A few tokens' logits are whole everywhere.
+        return logits if tokens is not None else constrain(logits, "batch", *(None,) * (logits.ndim - 2), "vocab")

@@ -50,9 +50,12 @@ class VLA(nn.Module):
         x, _ = self.language(x, positions, mask, prompts=prompts)
         return x[:, x.shape[1] - inputs.text_tokens.shape[1] + text_from :]
 
-    def lm_head(self, hidden: Array) -> Array:
-        """(..., width) -> float32 (..., V). Apply it to chosen hidden states where the vocabulary is large."""
-        return self.language.lm_head(hidden)
+    def lm_head(self, hidden: Array, tokens: np.ndarray | Array | None = None) -> Array:
+        """(..., width) -> float32 (..., V), or the logits of some ``tokens`` only.
+
+        Apply it to chosen hidden states, or tokens, where the vocabulary is large.
+        """
+        return self.language.lm_head(hidden, tokens)
 
     def __call__(self, inputs: ModelInputs, text_from: int = 0) -> Array:
         """Logits float32 (B, T - text_from, V)."""
@@ -61,7 +64,7 @@ class VLA(nn.Module):
     def prefill(self, inputs: ModelInputs, more_slots: int) -> tuple[Array, KVCache]:
         """Read visual tokens or prompts, and text, into a fresh cache with ``more_slots`` unused slots at its end.
 
-        Returns the logits (B, V) after each example's last valid text token, and the cache.
+        Returns the hidden state (B, width) of each example's last valid text token, and the cache.
         """
         x, positions, prompts = self._sequence(inputs)
         batch, length, _ = x.shape
@@ -70,18 +73,16 @@ class VLA(nn.Module):
         x, cache = self._continue(x, positions, mask, cache, 0, prompts)
         text_lengths = inputs.text_mask.sum(axis=1)
         last = length - inputs.text_tokens.shape[1] + text_lengths - 1
-        hidden = jnp.take_along_axis(x, last[:, None, None], axis=1)[:, 0]
-        return self.lm_head(hidden), cache
+        return jnp.take_along_axis(x, last[:, None, None], axis=1)[:, 0], cache
 
     def extend(
         self, tokens: Array, positions: Array, mask: Array, cache: KVCache, index: Array | int
     ) -> tuple[Array, KVCache]:
         """Read tokens int32 (B, C) at rotary ``positions`` (B, C) into the slots from ``index`` on.
 
-        mask: bool (B, C, S), the slots each token may look at. Returns the logits (B, V) after the last of them.
+        mask: bool (B, C, S), the slots each token may look at. Returns the hidden states (B, C, width).
         """
-        x, cache = self._continue(self.language.embed(tokens), positions, mask, cache, index)
-        return self.lm_head(x[:, -1]), cache
+        return self._continue(self.language.embed(tokens), positions, mask, cache, index)
 
     def _continue(
         self, x: Array, positions: Array, mask: Array, cache: KVCache, index: Array | int, prompts: Any = None

@@ -11,11 +11,12 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.encoding.encode import EncodingConfig, encode_observation
+from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.model.partition import constrain, shardings
 from dsvla_jax.model.variables import Variables, join_variables, narrow_frozen, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
-from dsvla_jax.training.objective import answer_counts, answer_loss, target_distributions
+from dsvla_jax.training.objective import answer_counts, answer_loss
 from dsvla_jax.types import Array, Camera, ModelInputs, Observation
 
 
@@ -33,7 +34,7 @@ TrainStep = Callable[[TrainState, Variables, dict[str, Array]], tuple[TrainState
 
 def initial_state(
     experiment: Experiment,
-    number_values: np.ndarray,
+    number_values: np.ndarray | None,
     optimizer: optax.GradientTransformation,
     params: Variables | None = None,
 ) -> tuple[TrainState, Variables]:
@@ -84,17 +85,16 @@ def model_inputs(batch: dict[str, Array], config: EncodingConfig) -> ModelInputs
 
 
 def make_train_step(
-    experiment: Experiment, model: VLA, optimizer: optax.GradientTransformation, number_values: np.ndarray
+    experiment: Experiment, model: VLA, optimizer: optax.GradientTransformation, targets: NumberTargets
 ) -> TrainStep:
     """``step(state, frozen, batch) -> (state, metrics)``, to be jitted by the caller (`jit_train_step`).
 
     Gradients are taken with respect to the trainable variables only: frozen parameters cost no weight gradient.
+    targets: of the tokenizer and style that the batches were written with.
     """
-    targets = target_distributions(number_values, experiment.soft_target_sigma)
-    targets = None if targets is None else jnp.asarray(targets)
 
     def step(state: TrainState, frozen: Variables, batch: dict[str, Array]):
-        counts = answer_counts(batch["answer_mask"], batch["soft_mask"])
+        counts = answer_counts(batch["answer_mask"], batch["number_rows"], targets)
 
         def part(batch: dict[str, Array]) -> tuple[Variables, dict[str, Array]]:
             inputs = model_inputs(
@@ -105,7 +105,7 @@ def make_train_step(
                 logits = model.apply(join_variables(trainable, frozen), inputs)
                 assert isinstance(logits, jax.Array)
                 return answer_loss(
-                    logits, inputs.text_tokens, batch["answer_mask"], batch["soft_mask"], targets, counts
+                    logits, inputs.text_tokens, batch["answer_mask"], batch["number_rows"], targets, counts
                 )
 
             gradients, metrics = jax.grad(loss_of, has_aux=True)(state.trainable)

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from dsvla_jax.command_line import fail_with_message
-from dsvla_jax.encoding.text import WordTokenizer
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.policy import load_policy_config
 from dsvla_jax.weights.base import import_backbones
 from dsvla_jax.weights.export import ExportOptions, export_run
@@ -76,7 +76,7 @@ def export_command(
     bases = {"language": language_base, "vision": vision_base}
     options = ExportOptions(merged, DTYPES[dtype], shard_gigabytes * 1e9, bases)
     config = load_policy_config(run)
-    folders = export_run(run, out, config.model, WordTokenizer.load(run / "tokenizer.json"), options)
+    folders = export_run(run, out, config.model, load_tokenizer(run), options)
     print(f"written: {out} ({', '.join(folders)})")
 
 

@@ -24,13 +24,13 @@ from safetensors.numpy import save_file
 from tqdm import tqdm
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, StoredVariable, require_same_shapes
-from dsvla_jax.encoding.text import WordTokenizer
+from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.lora import merge_lora, require_mergeable
 from dsvla_jax.model.variables import PROJECTION
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.weights.hugging_face import language_json, vision_json, write_json, write_tensors, write_word_tokenizer
+from dsvla_jax.weights.hugging_face import language_json, vision_json, write_json, write_tensors, write_tokenizer
 from dsvla_jax.weights.towers import AXES, CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
 
 TOWERS = ("language", "vision")
@@ -54,7 +54,7 @@ class ExportOptions:
     bases: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
 
 
-def export_run(run: Path, out: Path, model: ModelConfig, tokenizer: WordTokenizer, options: ExportOptions) -> list[str]:
+def export_run(run: Path, out: Path, model: ModelConfig, tokenizer: Tokenizer, options: ExportOptions) -> list[str]:
     """Writes the newest checkpoint of a run to ``out``, a new folder, which appears whole or not at all.
 
     In memory are one variable (a kind of weight of all layers) and one file at a time. Returns the folders in it.
@@ -146,11 +146,11 @@ def _write_model(
     write_tensors(folder, sizes, tensors(), options.shard_bytes)
 
 
-def _describe_model(folder: Path, tower: str, model: ModelConfig, tokenizer: WordTokenizer, dtype: str) -> None:
+def _describe_model(folder: Path, tower: str, model: ModelConfig, tokenizer: Tokenizer, dtype: str) -> None:
     if tower == "vision":
         write_json(folder / "config.json", vision_json(model.vision, dtype))
     else:
-        special = write_word_tokenizer(folder, tokenizer)
+        special = write_tokenizer(folder, tokenizer)
         write_json(folder / "config.json", language_json(model.language, dtype) | special)
 
 

@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 from tokenizers import AddedToken, Regex, models, normalizers, pre_tokenizers, processors
 from tokenizers import Tokenizer as FastTokenizer
 
-from dsvla_jax.encoding.text import WordTokenizer
+from dsvla_jax.encoding.text import Tokenizer, WordTokenizer
 from dsvla_jax.model.config import LanguageConfig, VisionConfig
 
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
@@ -105,8 +105,17 @@ def write_tensors(
         write_json(folder / INDEX, {"metadata": {"total_size": sum(sizes.values())}, "weight_map": where})
 
 
-def write_word_tokenizer(folder: Path, tokenizer: WordTokenizer) -> dict[str, int]:
-    """Writes a word-level vocabulary as AutoTokenizer opens it; returns its special ids as config.json names them.
+def write_tokenizer(folder: Path, tokenizer: Tokenizer) -> dict[str, int]:
+    """Writes a tokenizer as AutoTokenizer opens it; returns its special ids as config.json names them."""
+    if isinstance(tokenizer, WordTokenizer):
+        _write_word_tokenizer(folder, tokenizer)
+    else:
+        tokenizer.save(folder)
+    return {"pad_token_id": tokenizer.pad_id, "bos_token_id": tokenizer.bos_id, "eos_token_id": tokenizer.eos_id}
+
+
+def _write_word_tokenizer(folder: Path, tokenizer: WordTokenizer) -> None:
+    """A word-level vocabulary as a file of the `tokenizers` library.
 
     Its ids are those of `WordTokenizer.encode` behind the begin-of-sequence token. An integer without a token is
     <unk> there, where ours is an error.
@@ -135,4 +144,3 @@ def write_word_tokenizer(folder: Path, tokenizer: WordTokenizer) -> dict[str, in
     fast.save(str(folder / "tokenizer.json"))
     options = {"tokenizer_class": "PreTrainedTokenizerFast", "clean_up_tokenization_spaces": False}
     write_json(folder / "tokenizer_config.json", options | texts)
-    return {f"{name}_id": special[name] for name in ("pad_token", "bos_token", "eos_token")}
