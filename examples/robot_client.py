@@ -38,13 +38,13 @@ class SimulatedRobot:
     """One episode of a task in C MuJoCo, from a start that no demonstration has."""
 
     def __init__(self, task: str, image_size: int, seed: int):
-        self._environment = Environment(task, image_size=image_size)
-        self._state = self._environment.reset(episode_keys(0, "eval", task, seed, 1))
-        self.prompt = self._environment.instructions(self._state)[0]
-        self._keypoints = np.asarray(self._environment.keypoints(self._state))[0]
+        self.environment = Environment(task, image_size=image_size)
+        self._state = self.environment.reset(episode_keys(0, "eval", task, seed, 1))
+        self.prompt = self.environment.instructions(self._state, seed)[0]
+        self._keypoints = np.asarray(self.environment.keypoints(self._state))[0]
 
     def observe(self) -> dict[str, Any]:
-        seen = self._environment.observe(self._state)
+        seen = self.environment.observe(self._state)
         return {
             "rgb": np.asarray(seen.rgb)[0],
             "depth": np.asarray(seen.depth)[0],
@@ -57,10 +57,10 @@ class SimulatedRobot:
 
     def move(self, pose: np.ndarray, gripper_open: np.ndarray) -> None:
         action = Action(pose=np.asarray(pose)[None], gripper_open=np.asarray(gripper_open)[None])  # type: ignore[arg-type]
-        self._state = self._environment.execute(self._state, action)
+        self._state = self.environment.execute(self._state, action)
 
     def done(self) -> bool:
-        return bool(np.asarray(self._environment.success(self._state))[0])
+        return bool(np.asarray(self.environment.success(self._state))[0])
 
 
 class DryRun:

@@ -19,6 +19,8 @@ from dsvla_jax.serving.server import Limits, PolicyServer
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.training.experiment import load_experiment
 
+log = logging.getLogger("dsvla_jax.serving")
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -65,13 +67,13 @@ async def main(options: Options) -> None:
     """Serves until it is interrupted or told to end."""
     server = build_server(options)
     if options.token_file is None and not _is_loopback(options.host):
-        logging.warning("%s is reachable from other machines, and no --token-file is given", options.host)
+        log.warning("%s is reachable from other machines, and no --token-file is given", options.host)
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     try:
         async with server.listen(options.host, options.port):
-            logging.info("ready: ws://%s:%d, /healthz, /metrics", options.host, options.port)
+            log.info("ready: ws://%s:%d, /healthz, /metrics", options.host, options.port)
             await stop.wait()
     except OSError as error:
         raise UserError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from error
@@ -87,7 +89,7 @@ def _is_loopback(host: str) -> bool:
 if __name__ == "__main__":
     with fail_with_message():
         parsed = tyro.cli(Options, prog="python -m dsvla_jax.serving", description=__doc__)
-        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", force=True)
-        logging.getLogger("websockets").setLevel(logging.WARNING)
+        logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s", force=True)
+        logging.getLogger("dsvla_jax").setLevel(logging.INFO)
         configure_jax()
         asyncio.run(main(parsed))

@@ -126,6 +126,7 @@ class PolicyServer:
 
     async def _warm_up(self) -> None:
         # From the largest on: what does not fit into memory shows first.
+        log.info("compiling for batches of %s", ", ".join(map(str, reversed(self._sizes))))
         for arms in self.expected.arms:
             for height, width in self.expected.image_sizes:
                 for size in reversed(self._sizes):

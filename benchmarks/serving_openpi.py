@@ -1,0 +1,69 @@
+"""The published openpi-client package drives simulated episodes of a run's tasks through the server (3 minutes).
+
+    pip install --no-deps --target CLIENT openpi-client==0.1.2
+    PYTHONPATH=CLIENT python -m benchmarks.serving_openpi [RUN] [--episodes 4]
+
+Without its dependencies, because it pins NumPy 1; it runs with NumPy 2 all the same. Exits with 77 where it is missing,
+and with 1 unless an episode of every task for one arm succeeds, and as many as without a server.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+import dsvla_jax.policy
+from benchmarks._server import server_process
+from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.rollout import run_episodes
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.tasks import get_task, select_tasks
+from dsvla_jax.training.experiment import load_experiment
+from examples.robot_client import SimulatedRobot, run_episode
+
+NO_CLIENT = 77
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which run, on how many episodes a task."""
+
+    run: tyro.conf.Positional[Path] = Path("runs/tiny")
+    episodes: int = 4
+
+
+def main(options: Options) -> int:
+    try:
+        from openpi_client.websocket_client_policy import WebsocketClientPolicy  # type: ignore[import-not-found]
+    except ModuleNotFoundError as error:
+        print(f"no openpi-client ({error}); see the top of {__file__}", file=sys.stderr)
+        return NO_CLIENT
+    data, enough = load_experiment(options.run / "config.json").data, True
+    policy = dsvla_jax.policy.load(options.run)
+    with server_process(options.run, "--batch", "1", "--arms", "1") as (port, _):
+        for name in select_tasks(data.tasks):
+            if get_task(name).num_arms != 1:
+                continue
+            remote = []
+            for seed in range(options.episodes):
+                client = WebsocketClientPolicy("127.0.0.1", port)
+                robot = SimulatedRobot(name, data.image_size, seed)
+                limit = 2 * robot.environment.expert_keyframes
+                remote.append(run_episode(client, robot, robot.prompt, limit))
+                client._ws.close()
+            environment = Environment(name, image_size=data.image_size)
+            state = environment.reset(episode_keys(0, "eval", name, 0, options.episodes))
+            local = [ending.success for ending in run_episodes(environment, policy.act, state)]
+            print(f"{name}: {sum(remote)} of {options.episodes} through the server, {sum(local)} without", flush=True)
+            enough &= any(remote) and bool(np.array_equal(remote, local))
+    return int(not enough)
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        parsed = tyro.cli(Options, description=__doc__)
+        configure_jax()
+        sys.exit(main(parsed))
