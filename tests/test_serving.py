@@ -1,5 +1,6 @@
 """The policy server: the wire format, answers that are never crossed, and requests that mean no good."""
 
+import asyncio
 import concurrent.futures
 import contextlib
 import http.client
@@ -14,10 +15,13 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.geometry.cameras import front_camera, unproject
+from dsvla_jax.perception.keypoints import Sighting
 from dsvla_jax.serving.batching import answer_batch, batch_sizes
 from dsvla_jax.serving.client import PolicyClient, ServerError
 from dsvla_jax.serving.messages import MAX_CONTAINERS, MessageError, pack, unpack
 from dsvla_jax.serving.requests import BadRequest, parse_request
+from dsvla_jax.serving.server import Perception
 from dsvla_jax.serving.session import Session
 from tests.golden import serving as golden
 from tests.serving import SIZE, observation, running, small_server, tiny_policy
@@ -55,7 +59,7 @@ def ask(port: int, seed: int) -> dict:
 def expected_text(server, policy, seed: int) -> str:
     """What the policy answers by itself, without a server, to the first request of an episode."""
     request = parse_request(observation(seed), server.expected)
-    question, _ = server._question(request, Session())
+    question, _ = asyncio.run(server._question(request, Session()))
     return answer_batch(policy, [question], 1)[0].text
 
 
@@ -228,6 +232,50 @@ def test_a_policy_without_keypoints_needs_none():
         del request["keypoints"]
         with PolicyClient(port=port) as client:
             assert client.infer(request)["keypoint"] is None
+
+
+def test_keypoints_are_found_in_the_picture_of_a_robot_that_sends_none(policy):
+    """The "detector" finds what is brighter than the rest; the server remembers it for the episode."""
+
+    def bright(rgb, phrases):
+        mask = rgb.min(axis=-1) > 250
+        return [Sighting(phrase, mask if mask.any() else None, problem="it is dark") for phrase in phrases]
+
+    request = observation(0)
+    del request["keypoints"]
+    dark = {**request, "rgb": np.zeros((SIZE, SIZE, 3), np.uint8), "depth": np.full((SIZE, SIZE), 1.0)}
+    lit = {**dark, "rgb": dark["rgb"].copy()}
+    lit["rgb"][20:25, 8:13] = 255
+    with (
+        running(lambda: small_server(policy, limits={"batch": 1}, perception=Perception(bright))) as (_, port),
+        PolicyClient(port=port) as client,
+    ):
+        assert client.metadata["needs_keypoints"] is False
+        with pytest.raises(ServerError, match="keypoints not found: 'little green light switch': it is dark"):
+            client.infer(dark)
+        (point,) = client.infer(lit)["keypoint"]
+        expected = np.asarray(unproject(dark["depth"], front_camera(SIZE)))[22, 10]
+        np.testing.assert_allclose(point, expected, atol=1e-5)
+        assert client.infer(dark)["keypoint"] == [point]
+        with pytest.raises(ServerError, match="it is dark"):
+            client.infer({**dark, "reset": True})
+        with pytest.raises(ServerError, match="no object phrases for the instruction 'sing'"):
+            client.infer({**lit, "prompt": "sing"})
+
+
+def test_messages_with_bytes_changed_are_answered_or_refused_and_nothing_else(running_server):
+    whole, rng = pack(observation(0)), np.random.default_rng(0)
+    outcomes = set()
+    for _ in range(1000):
+        changed = bytearray(whole)
+        for place in rng.integers(0, 300 if rng.random() < 0.7 else len(whole), 3):
+            changed[place] = rng.integers(256)
+        try:
+            parse_request(unpack(bytes(changed[: rng.integers(1, 2 * len(whole))])), running_server[0].expected)
+            outcomes.add("answered")
+        except (MessageError, BadRequest) as error:
+            outcomes.add(type(error))
+    assert outcomes == {"answered", MessageError, BadRequest}
 
 
 def test_health_and_metrics(running_server):

@@ -9,13 +9,15 @@ import ipaddress
 import logging
 import signal
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
 from dsvla_jax import policy as policies
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
-from dsvla_jax.serving.server import Limits, PolicyServer
+from dsvla_jax.perception.grounding import GroundingOptions
+from dsvla_jax.serving.server import Limits, Perception, PolicyServer
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.training.experiment import load_experiment
 
@@ -37,6 +39,9 @@ class Options:
     """Numbers of arms; those of the run's tasks if not given."""
     token_file: Path | None = None
     """A file with the secret that robots must show as `Authorization: Bearer`."""
+    perception: Literal["off", "first", "refresh"] = "off"
+    """Finds the keypoints of robots that send none: in the first picture of an episode, or again in every one."""
+    grounding: tyro.conf.OmitArgPrefixes[GroundingOptions] = dataclasses.field(default_factory=GroundingOptions)
     limits: tyro.conf.OmitArgPrefixes[Limits] = dataclasses.field(default_factory=Limits)
 
 
@@ -53,7 +58,12 @@ def build_server(options: Options) -> PolicyServer:
         token = options.token_file.read_text().strip()
         if not token:
             raise UserError(f"{options.token_file}: expected a token, the file is empty")
-    return PolicyServer(policies.load(options.run), sizes, arms, options.limits, token, name=options.run.name)
+    perception = None
+    if options.perception != "off":
+        grounding = options.grounding
+        perception = Perception(grounding.segmenter(), options.perception == "refresh", grounding.table())
+    policy = policies.load(options.run)
+    return PolicyServer(policy, sizes, arms, options.limits, token, options.run.name, perception)
 
 
 def _parse_size(text: str) -> tuple[int, int]:

@@ -94,6 +94,7 @@ def parse_request(message: Any, expected: Expected) -> Request:
     rotation = world_from_camera[:3, :3]
     if (
         not np.array_equal(world_from_camera[3], (0, 0, 0, 1))
+        or np.abs(rotation).max() > 1.01
         or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
         or np.linalg.det(rotation) < 0
     ):

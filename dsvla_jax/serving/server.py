@@ -12,6 +12,7 @@ import http
 import logging
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.perception.keypoints import KeypointTracker, Segmenter
+from dsvla_jax.perception.phrases import TABLE, ObjectPhrases, phrases_for
 from dsvla_jax.policy import Policy
 from dsvla_jax.serving.batching import Answer, MicroBatcher, Question, Timing, answer_batch, batch_sizes, blank_question
 from dsvla_jax.serving.messages import pack, unpack
@@ -50,11 +53,23 @@ class Limits:
     """Between two requests of a robot."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Perception:
+    """How keypoints are found for robots that send none.
+
+    refresh: at every request, not only at the first of an episode. phrases: what objects an instruction names.
+    """
+
+    segment: Segmenter
+    refresh: bool = False
+    phrases: Sequence[ObjectPhrases] = TABLE
+
+
 class PolicyServer:
     """Serves one policy. ``async with PolicyServer(...).listen(host, port) as socket_server: ...``
 
     token: what robots must show as ``Authorization: Bearer`` (or openpi's ``Api-Key``); None lets anyone in.
-    name: of the policy, told to robots.
+    name: of the policy, told to robots. perception: None for a server whose robots know their keypoints.
     """
 
     def __init__(
@@ -65,6 +80,7 @@ class PolicyServer:
         limits: Limits | None = None,
         token: str | None = None,
         name: str = "policy",
+        perception: Perception | None = None,
     ):
         self.limits = limits or Limits()
         self.expected = Expected(tuple(image_sizes), tuple(arms), policy.codec)
@@ -72,6 +88,7 @@ class PolicyServer:
         self._policy, self._token, self._name = policy, token, name
         self._sizes = batch_sizes(self.limits.batch)
         self._batcher = MicroBatcher(lambda questions, size: answer_batch(policy, questions, size), self._sizes)
+        self._perception, self._perception_thread = perception, ThreadPoolExecutor(1, thread_name_prefix="perception")
         self._ready = asyncio.Event()
         self._clients = 0
 
@@ -88,7 +105,7 @@ class PolicyServer:
                 "keypoint": "the active keypoint of each arm, metres, world frame, or None",
                 "reached": "how many keypoints each arm has reached",
             },
-            "needs_keypoints": self._policy.config.encoding.use_keypoints,
+            "needs_keypoints": self._policy.config.encoding.use_keypoints and self._perception is None,
             "image_sizes": [list(size) for size in self.expected.image_sizes],
             "arms": list(self.expected.arms),
             "workspace_low": list(self.expected.codec.low),
@@ -181,7 +198,9 @@ class PolicyServer:
             self.metrics.connections.set(self._clients)
 
     async def _converse(self, connection: ServerConnection) -> None:
-        session, previous = Session(), None
+        looking = self._perception
+        session = Session(looking and KeypointTracker(looking.segment, looking.refresh))
+        previous = None
         while True:
             try:
                 message = await self._receive(connection)
@@ -218,8 +237,8 @@ class PolicyServer:
             if isinstance(message, str):
                 raise BadRequest("expected a binary frame of msgpack, got a text frame")
             request = parse_request(unpack(message), self.expected)
-            question, reached = self._question(request, session)
             async with asyncio.timeout(self.limits.request_seconds):
+                question, reached = await self._question(request, session)
                 answer, timing = await self._batcher.ask(question)
         except UserError as error:
             return "bad", str(error)
@@ -233,13 +252,11 @@ class PolicyServer:
         self.metrics.batch.observe(timing.batch)
         return "answered", pack(_reply_map(question, answer, timing, reached, previous))
 
-    def _question(self, request: Request, session: Session) -> tuple[Question, np.ndarray | None]:
+    async def _question(self, request: Request, session: Session) -> tuple[Question, np.ndarray | None]:
         """The request as the policy is asked it. What the policy would refuse is refused here, for one robot alone."""
         keypoints = reached = None
         if self._policy.config.encoding.use_keypoints:
-            if request.keypoints is None:
-                raise BadRequest("keypoints: this policy was trained with them; send " + OPTIONAL_FIELDS["keypoints"])
-            keypoints, reached = session.advance(request, request.keypoints)
+            keypoints, reached = session.advance(request, await self._all_keypoints(request, session))
         observation = request.observation
         pose, gripper_open = np.asarray(observation.pose), np.asarray(observation.gripper_open)
         try:
@@ -247,6 +264,22 @@ class PolicyServer:
         except ValueError as error:
             raise BadRequest(f"prompt: {error}") from error
         return Question(request.instruction, observation, keypoints), reached
+
+    async def _all_keypoints(self, request: Request, session: Session) -> np.ndarray:
+        """float32 (A, K, 3), those that the robot sent or those that are seen."""
+        if request.keypoints is not None:
+            return request.keypoints
+        if self._perception is None:
+            raise BadRequest(
+                f"keypoints: this policy was trained with them; send {OPTIONAL_FIELDS['keypoints']}, "
+                "or start the server with --perception first"
+            )
+        arms, count = phrases_for(request.instruction, self._perception.phrases), request.shape[0]
+        if len(arms) not in (1, count):
+            raise BadRequest(f"prompt: its objects are for {len(arms)} arms, the pose has {count}")
+        arms = arms * (count // len(arms))
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._perception_thread, session.look, request, arms)
 
 
 class _TooManyFragments(Exception):
