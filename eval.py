@@ -172,7 +172,7 @@ def load_strips(file: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str,
 if __name__ == "__main__":
     with fail_with_message():
         parsed = tyro.cli(Options, prog="eval.py", description=__doc__)
-        configure_jax()
+        configure_jax(parsed.physics)
         started = time.monotonic()
         main(parsed)
         print(f"{time.monotonic() - started:.0f} s", file=sys.stderr)

@@ -90,7 +90,7 @@ def mjx_throughput(name: str, batches: tuple[int, ...]) -> None:
 
 
 def main(options: Options) -> int:
-    configure_jax()
+    configure_jax("mjx")
     ratios = [c_ratio(name) for name in (options.light, options.heavy)]
     for name in (options.light, options.heavy) if options.mjx_batches else ():
         mjx_throughput(name, options.mjx_batches)

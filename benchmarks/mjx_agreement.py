@@ -49,7 +49,7 @@ def compare(name: str, episodes: int) -> dict[str, float | str]:
 
 
 def main(options: Options) -> int:
-    configure_jax()
+    configure_jax("mjx")
     done = [json.loads(x) for x in options.out.read_text().splitlines()] if options.out and options.out.exists() else []
     results = {result["task"]: result for result in done}
     for name in select_tasks(options.tasks):

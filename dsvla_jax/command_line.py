@@ -29,8 +29,15 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dsvla_jax"
 
 
-def configure_jax() -> None:
-    """Keeps compiled programs on disk, so that the second run of anything starts at once."""
+def configure_jax(physics: str = "mujoco") -> None:
+    """Keeps compiled programs on disk, so that the second run of anything starts at once. Call it before any array.
+
+    physics: "mjx" if MJX will run.
+    """
+    if physics == "mjx" and jax.__version_info__ < (0, 11):
+        # Among several threads, XLA's CPU client of jax 0.10 loses large programs of MJX (stack_blocks'), which then
+        # never end. It reads this when it starts; MJX's arrays are too small to gain from threads.
+        os.environ.setdefault("NPROC", "1")
     if jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -135,7 +135,7 @@ class Environment:
         states = [state]
         for m in range(plan.pose.shape[1]):
             state = self.execute(states[-1], Action(plan.pose[:, m], plan.gripper_open[:, m]))
-            # XLA's CPU client stops for good when more than 32 programs that wait for each other are in its queue.
+            # Otherwise the whole plan would be in the queue of a device before its first key pose is done.
             states.append(jax.block_until_ready(state))
         return states
 
