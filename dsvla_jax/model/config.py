@@ -84,6 +84,7 @@ class LanguageConfig:
     """A LLaMA decoder; the defaults are LLaMA-7B.
 
     explicit_head_dim: width of one head; None for width / heads.
+    biases: which linear layers have one. LLaMA's have none; LLaMA-Adapter trains those of q, o, gate, up and down.
     """
 
     vocab_size: int = 32000
@@ -97,6 +98,7 @@ class LanguageConfig:
     tie_embeddings: bool = False
     explicit_head_dim: int | None = None
     rope_scaling: RopeScaling | None = None
+    biases: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.explicit_head_dim is None:
@@ -110,6 +112,8 @@ class LanguageConfig:
                 self.explicit_head_dim > 0 and self.explicit_head_dim % 2 == 0,
                 f"language: explicit_head_dim must be positive and even (rotary halves), got {self.explicit_head_dim}",
             )
+        unknown = sorted(set(self.biases) - set(LORA_TARGETS))
+        _require(not unknown, f"language: unknown biases {unknown}; choose from {list(LORA_TARGETS)}")
         _require(
             self.heads % self.kv_heads == 0,
             f"language: heads {self.heads} is not a multiple of kv_heads {self.kv_heads}",

@@ -3,6 +3,8 @@
 Touvron et al. 2023; parameter layout and rotation as in Hugging Face's Llama.
 """
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -126,14 +128,18 @@ class DecoderBlock(nn.Module):
         prompt: LayerPrompts | PromptCache | None = None,
     ) -> tuple[Array, KVCache | None]:
         language, dtype = self.config.language, self.config.compute_dtype
-        options = {"lora": self.config.lora_for("language"), "dtype": dtype}
         into_residual = residual_init(language.layers)
         x = constrain(x, "batch")
+
+        def linear(name: str, width: int, **options: Any) -> LoraDense:
+            bias, lora = name in language.biases, self.config.lora_for("language")
+            return LoraDense(width, name=name, use_bias=bias, lora=lora, dtype=dtype, **options)
+
         query_width, kv_width = language.heads * language.head_dim, language.kv_heads * language.head_dim
 
         y = RMSNorm(language.norm_eps, name="attention_norm")(x)
-        query = rotate(split_heads(LoraDense(query_width, name="q", **options)(y), language.heads), tables)
-        to_key, to_value = (LoraDense(kv_width, name=name, **options) for name in "kv")
+        query = rotate(split_heads(linear("q", query_width)(y), language.heads), tables)
+        to_key, to_value = (linear(name, kv_width) for name in "kv")
         key = rotate(split_heads(to_key(y), language.kv_heads), tables)
         value = split_heads(to_value(y), language.kv_heads)
         if cache is not None:
@@ -152,13 +158,13 @@ class DecoderBlock(nn.Module):
             gate = jnp.tanh(prompt.gate)[:, None, None].astype(dtype)
             attended += gate * attend(query, prompt.keys, prompt.values, implementation=self.config.attention)
         y = join_heads(attended)
-        x = x + LoraDense(language.width, kernel_init=into_residual, name="o", **options)(y)
+        x = x + linear("o", language.width, kernel_init=into_residual)(y)
 
         y = RMSNorm(language.norm_eps, name="mlp_norm")(x)
-        gate = LoraDense(language.ffn, name="gate", **options)(y)
-        up = LoraDense(language.ffn, name="up", **options)(y)
+        gate = linear("gate", language.ffn)(y)
+        up = linear("up", language.ffn)(y)
         y = jax.nn.silu(gate) * up
-        x = x + LoraDense(language.width, kernel_init=into_residual, name="down", **options)(y)
+        x = x + linear("down", language.width, kernel_init=into_residual)(y)
         return x, cache
 
 

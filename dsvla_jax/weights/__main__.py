@@ -1,10 +1,11 @@
 """Other projects' weights in and ours out:
 
-    python -m dsvla_jax.weights import SRC OUT [--vision SRC2] [--image-size 336]
+    python -m dsvla_jax.weights import SRC OUT [--vision SRC2] [--adapter FILE] [...]
     python -m dsvla_jax.weights export RUN OUT [--merged] [--dtype bfloat16]
 
-SRC is the folder of a Hugging Face checkpoint with a LLaMA decoder, SRC2 of one with a CLIP vision tower. RUN is a run
-folder of train.py.
+SRC has a LLaMA decoder: a Hugging Face folder, Meta's, or a GGUF file. SRC2 has a CLIP vision tower: a Hugging Face
+folder, or OpenAI's file. FILE has what LLaMA-Adapter's training adds to both. RUN is a run folder of train.py.
+docs/weights.md says more.
 """
 
 import sys
@@ -17,6 +18,7 @@ import tyro
 
 from dsvla_jax.command_line import fail_with_message
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
+from dsvla_jax.model.config import VisualPromptConfig
 from dsvla_jax.policy import load_policy_config
 from dsvla_jax.weights.base import import_backbones
 from dsvla_jax.weights.export import ExportOptions, export_run
@@ -33,18 +35,25 @@ def import_command(
     image_size: int | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
     projection: bool = False,
+    adapter: Path | None = None,
+    adapter_heads: int = VisualPromptConfig().heads,
 ) -> None:
-    """Writes the towers of Hugging Face checkpoints to a new folder, as parameters of this project's model.
+    """Writes the towers of checkpoints to a new folder, as parameters of this project's model.
 
     Args:
-        source: folder with config.json and safetensors of a LLaMA decoder.
+        source: a LLaMA decoder: a Hugging Face folder (config.json and safetensors), Meta's (params.json and
+            consolidated.00.pth), or a GGUF file.
         out: the folder to write; it appears whole or not at all.
-        vision: folder with config.json and safetensors of a CLIP vision tower.
+        vision: a CLIP vision tower: a Hugging Face folder, or OpenAI's file (.pt).
         image_size: resample the tower's positional embeddings to images of this many pixels.
         dtype: of the numbers on disk; bfloat16 takes half the space and memory.
         projection: keep CLIP's projection into its joint embedding, which LLaMA-Adapter reads.
+        adapter: a PyTorch file of LLaMA-Adapter's projection, gates and adapters, as ManipLLM and 3DS-VLA keep them.
+        adapter_heads: attention heads of the adapter's visual blocks, which no file says.
     """
-    towers = import_backbones(source, out, vision, image_size, DTYPES[dtype], projection)
+    towers = import_backbones(
+        source, out, vision, image_size, DTYPES[dtype], projection, adapter=adapter, adapter_heads=adapter_heads
+    )
     for name, tower in towers.items():
         print(f"{name}: {tower.size:,} parameters, {tower.config}")
         if tower.unused:

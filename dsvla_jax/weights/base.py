@@ -1,4 +1,4 @@
-"""Imported backbones on disk: what a Hugging Face checkpoint becomes once, and a model starts from many times."""
+"""Imported backbones on disk: what checkpoints of other projects become once, and models start from many times."""
 
 import dataclasses
 from pathlib import Path
@@ -9,18 +9,33 @@ import jax
 import numpy as np
 
 from dsvla_jax.checkpoints import CheckpointError
-from dsvla_jax.model.config import LanguageConfig, VisionConfig
+from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
+from dsvla_jax.model.vla import initialize
 from dsvla_jax.weights.folder import create_weights, describe_weights, restore_weights
+from dsvla_jax.weights.llama_adapter import read_adapter
+from dsvla_jax.weights.sources import read_language, read_vision
 from dsvla_jax.weights.tensors import WeightsError
-from dsvla_jax.weights.towers import Tower, read_language, read_vision, tower_shapes
+from dsvla_jax.weights.towers import Tower
+
+# Where each tower's parameters are among a model's variables.
+VARIABLES = {
+    "language": "params/language",
+    "vision": "params/vision",
+    "projector": "params/projector",
+    "lora": "lora/language",
+}
+# What is trained further is not rounded.
+TRAINED = ("projector", "lora")
 
 
 @dataclasses.dataclass(frozen=True)
 class Towers:
-    """The sizes of the towers that an imported folder holds; vision is None where none was imported."""
+    """The sizes of what an imported folder holds; None for what was not imported."""
 
     language: LanguageConfig
-    vision: VisionConfig | None
+    vision: VisionConfig | None = None
+    projector: VisualPromptConfig | None = None
+    lora: LoraConfig | None = None
 
 
 _converter = cattrs.Converter(forbid_extra_keys=True)
@@ -33,27 +48,38 @@ def import_backbones(
     image_size: int | None = None,
     dtype: Any = np.float32,
     projection: bool = False,
+    adapter: Path | None = None,
+    adapter_heads: int = VisualPromptConfig().heads,
 ) -> dict[str, Tower]:
-    """Writes the towers of Hugging Face folders to ``out``, a new folder, whole or not at all.
+    """Writes the towers of checkpoints to ``out``, a new folder, whole or not at all.
 
-    In memory are few rows of a tensor at a time. image_size, projection: see `read_vision`. dtype: of what is kept on
-    disk. Returns what was written, by tower.
+    In memory are few rows of a tensor at a time. source, vision_source: see `read_language` and `read_vision`, there
+    also image_size and projection. dtype: of the towers on disk. adapter: a file of LLaMA-Adapter's projection, gates
+    and adapters for these towers (`read_adapter`); adapter_heads: of its visual blocks. Returns what was written.
     Raises WeightsError where a source does not fit, CheckpointError where ``out`` exists.
     """
-    if vision_source is None and (image_size is not None or projection):
-        raise WeightsError("image size and projection are the vision tower's: name the folder that has one (--vision)")
+    if vision_source is None and (image_size is not None or projection or adapter is not None):
+        raise WeightsError(
+            "image size, projection and adapter need a vision tower: name the source that has one (--vision)"
+        )
     towers = {"language": read_language(source)}
     if vision_source is not None:
-        towers["vision"] = read_vision(vision_source, image_size, projection)
-    sizes = Towers(**{"vision": None} | {name: tower.config for name, tower in towers.items()})  # pyright: ignore
+        towers["vision"] = read_vision(vision_source, image_size, projection or adapter is not None)
+    if adapter is not None:
+        added = read_adapter(adapter, towers["language"].config, towers["vision"].config, adapter_heads)
+        towers["language"] = towers["language"].replaced(added.language, added.instead, adapter)
+        towers["projector"] = added.projector
+        towers |= {} if added.lora is None else {"lora": added.lora}
+    sizes = Towers(**{name: tower.config for name, tower in towers.items()})
     leaves = {
-        f"{name}/{path}": jax.ShapeDtypeStruct(shape, dtype)
+        f"{VARIABLES[name]}/{path}": jax.ShapeDtypeStruct(shape, np.float32 if name in TRAINED else dtype)
         for name, tower in towers.items()
         for path, shape in tower.shapes.items()
     }
-    with create_weights(out, leaves, "/layers/", dataclasses.asdict(sizes)) as arrays:
+    with create_weights(out, leaves, dataclasses.asdict(sizes)) as arrays:
         for name, tower in towers.items():
-            tower.copy_to({path: arrays[f"{name}/{path}"] for path in tower.shapes}, dtype)
+            own = {path: f"{VARIABLES[name]}/{path}" for path in tower.shapes}
+            tower.copy_to({path: arrays[full] for path, full in own.items()}, leaves[next(iter(own.values()))].dtype)
     return towers
 
 
@@ -67,16 +93,23 @@ def read_towers(folder: Path) -> Towers:
 
 
 def backbone_shapes(folder: Path) -> dict[str, Any]:
-    """The params of the towers in a folder, by tower, as float32 ShapeDtypeStructs."""
+    """The variables in a folder, {"params": by tower, and "lora" if there are any}, as float32 ShapeDtypeStructs."""
     towers = read_towers(folder)
-    shapes = {"language": tower_shapes(towers.language)}
-    if towers.vision is not None:
-        shapes["vision"] = tower_shapes(towers.vision)
-    return shapes
+    config = ModelConfig(
+        vision=towers.vision or VisionConfig(),
+        language=towers.language,
+        fusion="prefix" if towers.projector is None else "adapter",
+        visual_prompt=towers.projector or VisualPromptConfig(),
+        lora=towers.lora,
+    )
+    variables = jax.eval_shape(lambda: initialize(config, jax.random.key(0)))
+    present = [name for name in ("language", "vision", "projector") if getattr(towers, name) is not None]
+    shapes = {"params": {name: variables["params"][name] for name in present}}
+    return shapes if towers.lora is None else {**shapes, "lora": variables["lora"]}
 
 
 def load_backbones(folder: Path, like: Any = None) -> dict[str, Any]:
-    """The params of the towers in a folder, by tower: they replace those of a model of `read_towers`' sizes.
+    """The variables in a folder: they replace those of a model of `read_towers`' sizes.
 
     like: what `backbone_shapes` gives, with the dtypes and shardings that are wanted; None for float32 on one device.
     Raises CheckpointError where the folder does not hold them.

@@ -67,8 +67,8 @@ def read_language_config(folder: Path) -> LanguageConfig:
     """The sizes of a LLaMA decoder. Raises WeightsError where the architecture is another one."""
     section = _section(folder, "llama", "text_config")
     section.require("hidden_act", "silu")
-    section.require("attention_bias", False)
-    section.require("mlp_bias", False)
+    biases = ("q", "k", "v", "o") if section.values.get("attention_bias") else ()
+    biases += ("gate", "up", "down") if section.values.get("mlp_bias") else ()
     base = LanguageConfig()
     width = section.integer("hidden_size", base.width)
     heads = section.integer("num_attention_heads", base.heads)
@@ -87,6 +87,7 @@ def read_language_config(folder: Path) -> LanguageConfig:
             tie_embeddings=bool(section.values.get("tie_word_embeddings", False)),
             explicit_head_dim=None if head_dim * heads == width else head_dim,
             rope_scaling=scaling,
+            biases=biases,
         )
     except ValueError as error:
         raise WeightsError(f"{section.file}: {error}") from error

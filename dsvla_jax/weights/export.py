@@ -30,8 +30,9 @@ from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.lora import merge_lora, require_mergeable
 from dsvla_jax.model.variables import PROJECTION
 from dsvla_jax.model.vla import initialize
+from dsvla_jax.weights.from_hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
 from dsvla_jax.weights.hugging_face import language_json, vision_json, write_json, write_tensors, write_tokenizer
-from dsvla_jax.weights.towers import AXES, CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
+from dsvla_jax.weights.towers import AXES
 
 TOWERS = ("language", "vision")
 

@@ -21,18 +21,18 @@ from jax.sharding import SingleDeviceSharding
 from dsvla_jax.checkpoints import CheckpointError, require_same_shapes
 
 DESCRIPTION, PARAMS = "description.json", "params"
-# Numbers along each side of a chunk: 8 MB of bfloat16. A chunk is read whole by each device that needs a part of it.
+# Numbers along each of a chunk's two sides, 8 MB of bfloat16. Whoever needs a part of a chunk reads all of it.
 CHUNK = 2048
 
 
 @contextlib.contextmanager
 def create_weights(
-    folder: Path, leaves: Mapping[str, jax.ShapeDtypeStruct], stacked: str, description: dict[str, Any]
+    folder: Path, leaves: Mapping[str, jax.ShapeDtypeStruct], description: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """A new folder of weights: it appears when the block ends, and not at all where it raises or is killed.
 
-    leaves: by path ("language/layers/q/kernel"). stacked: the part of a path that says that the leading axis counts
-    layers, which are chunked apart. Yields an array on disk for each leaf: ``arrays[path][index] = values`` writes.
+    leaves: by path ("language/layers/q/kernel"). Yields an array on disk for each: ``arrays[path][index] = values``
+    writes.
     """
     if folder.exists():
         raise CheckpointError(f"{folder} exists already; remove it, or choose another folder")
@@ -48,7 +48,7 @@ def create_weights(
         handler = ocp.PyTreeCheckpointHandler(use_ocdbt=False)
         handler.save(partial / PARAMS, args=ocp.args.PyTreeSave(tree))  # pyright: ignore[reportArgumentType]
         handler.close()
-        yield {path: _create_array(partial, path, leaf, stacked in path) for path, leaf in leaves.items()}
+        yield {path: _create_array(partial, path, leaf) for path, leaf in leaves.items()}
         (partial / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
         partial.rename(folder)
     except BaseException:
@@ -56,8 +56,8 @@ def create_weights(
         raise
 
 
-def _create_array(folder: Path, path: str, leaf: jax.ShapeDtypeStruct, stacked: bool) -> Any:
-    chunks = [1 if stacked and axis == 0 else min(size, CHUNK) for axis, size in enumerate(leaf.shape)]
+def _create_array(folder: Path, path: str, leaf: jax.ShapeDtypeStruct) -> Any:
+    chunks = [1] * (leaf.ndim - 2) + [min(size, CHUNK) for size in leaf.shape[-2:]]
     metadata = {"chunks": chunks, "compressor": {"id": "zstd", "level": 1}}
     spec = _spec(folder / PARAMS / path.replace("/", ".")) | {"metadata": metadata}
     return ts.open(spec, create=True, delete_existing=True, shape=leaf.shape, dtype=ts.dtype(leaf.dtype)).result()

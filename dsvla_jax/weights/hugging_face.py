@@ -15,20 +15,30 @@ from tokenizers import AddedToken, Regex, models, normalizers, pre_tokenizers, p
 from tokenizers import Tokenizer as FastTokenizer
 
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer
+from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LanguageConfig, VisionConfig
 
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
 
 
 def language_json(config: LanguageConfig, dtype: str) -> dict[str, Any]:
-    """The config.json of a LlamaForCausalLM, without the ids of special tokens."""
+    """The config.json of a LlamaForCausalLM, without the ids of special tokens.
+
+    Raises UserError where some but not all layers of the attention, or of the MLP, have biases: it has no such model.
+    """
+    attention, mlp = ({*group} & {*config.biases} for group in (("q", "k", "v", "o"), ("gate", "up", "down")))
+    if len(attention) not in (0, 4) or len(mlp) not in (0, 3):
+        raise UserError(
+            f"the decoder has biases in {', '.join(config.biases)} only, as LLaMA-Adapter trains them; "
+            "no LlamaForCausalLM has, so it cannot be exported as one"
+        )
     scaling = config.rope_scaling
     fields = {
         "architectures": ["LlamaForCausalLM"],
         "model_type": "llama",
         "hidden_act": "silu",
-        "attention_bias": False,
-        "mlp_bias": False,
+        "attention_bias": bool(attention),
+        "mlp_bias": bool(mlp),
         "vocab_size": config.vocab_size,
         "hidden_size": config.width,
         "num_hidden_layers": config.layers,

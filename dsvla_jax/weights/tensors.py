@@ -19,7 +19,11 @@ class WeightsError(UserError):
 
 @dataclasses.dataclass(frozen=True)
 class StoredTensor:
-    """Where one tensor lies, row-major. dtype: its name in FLOATS. begin, end: bytes from the start of the file."""
+    """Where one tensor lies, row-major. dtype: its name in FLOATS. begin, end: bytes from the start of the file.
+
+    head_dim: not 0 where rows that are rotated together lie side by side, in heads of so many rows; they are read as
+    the model wants them, half a head apart.
+    """
 
     key: str
     file: Path
@@ -27,6 +31,7 @@ class StoredTensor:
     shape: tuple[int, ...]
     begin: int
     end: int
+    head_dim: int = 0
 
     def check(self) -> None:
         """Raises WeightsError where the numbers are of no kind that is read, or do not fill their bytes."""
@@ -45,14 +50,23 @@ class StoredTensor:
     def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows ``start`` to ``stop`` of the first axis, in memory of their own: a mapped file would count as ours."""
         self.check()
-        rows, *rest = self.shape or (1,)
-        stop = rows if stop is None else stop
-        row_bytes = (self.end - self.begin) // max(rows, 1)
-        content = self._bytes(self.begin + start * row_bytes, (stop - start) * row_bytes)
-        return content.view(FLOATS[self.dtype]).reshape((stop - start, *rest) if self.shape else ())
-
-    def _bytes(self, begin: int, count: int) -> np.ndarray:
-        content = np.fromfile(self.file, np.uint8, count, offset=begin)
-        if len(content) != count:
+        stop = self.shape[0] if stop is None else stop
+        part = self.rows(start, stop)
+        content = np.fromfile(self.file, np.uint8, part.end - part.begin, offset=part.begin)
+        if len(content) != part.end - part.begin:
             raise WeightsError(f"{self.file}: {self.key}: cut short while it was read; {AGAIN}")
-        return content
+        values = self._decode(content).reshape(part.shape)
+        if not self.head_dim:
+            return values
+        return values.reshape(-1, self.head_dim // 2, 2, *self.shape[1:]).swapaxes(1, 2).reshape(values.shape)
+
+    def _decode(self, content: np.ndarray) -> np.ndarray:
+        return content.view(FLOATS[self.dtype])
+
+    def rows(self, start: int, stop: int) -> "StoredTensor":
+        """The part between two rows of the first axis."""
+        row = (self.end - self.begin) // self.shape[0]
+        begin = self.begin + start * row
+        return dataclasses.replace(
+            self, shape=(stop - start, *self.shape[1:]), begin=begin, end=begin + (stop - start) * row
+        )
