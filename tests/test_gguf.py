@@ -96,7 +96,7 @@ def without(name):
         (lambda f: write_gguf(f, draw_model(), "F32", block_count=1), "no place in this architecture for: blk.1"),
         (
             lambda f: write_gguf(f, draw_model(), "F32", feed_forward_length=64),
-            r"blk.0.ffn_gate.weight: expected shape \(64, 64\) .* found \(96, 64\)",
+            r"blk.0.ffn_down.weight: expected shape \(64, 64\) .* found \(64, 96\)",
         ),
         (lambda f: write_gguf(f, draw_model(), "F32", **{"rope.dimension_count": 8}), "rope.dimension_count: only 16"),
         (lambda f: f.write_bytes(b"GGUX" + bytes(100)), r"model\.gguf: not a GGUF file, or cut short"),

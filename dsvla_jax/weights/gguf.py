@@ -38,7 +38,7 @@ class QuantizedTensor(StoredTensor):
         kind = _package().GGMLQuantizationType[self.dtype]
         try:
             row = quants.quant_shape_to_byte_shape(self.shape, kind)
-            quants.dequantize(np.zeros(0, np.uint8), kind)
+            quants.dequantize(np.zeros(row[-1], np.uint8), kind)
         except (ValueError, NotImplementedError) as error:
             raise WeightsError(f"{self.file}: {self.key}: {self.dtype} {self.shape} is not read: {error}") from error
         if self.end > self.file.stat().st_size or self.end - self.begin != int(np.prod(row)):
