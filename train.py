@@ -35,6 +35,7 @@ from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.weights.base import is_imported, load_for_model
 
 # Embeddings have more rows than the vocabulary has tokens where their number was rounded up, by fewer than so many.
 PADDING_ROWS = 1024
@@ -68,7 +69,7 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
     model = VLA(experiment.model)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
-    state, frozen = make_sharded(start, mesh, base_params(experiment, mesh))
+    state, frozen = make_sharded(start, mesh, base_variables(experiment, mesh))
     report_size(state.trainable, frozen, reader.num_frames)
 
     if checkpoints.latest_step is not None:
@@ -116,14 +117,17 @@ def tokenizer_of(experiment: Experiment) -> Tokenizer:
     return tokenizer
 
 
-def base_params(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str, Any] | None:
-    """The parameters of the base run, split over the mesh; None where the experiment starts from random ones."""
+def base_variables(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str, Any]:
+    """The variables that a base run or imported weights have for the experiment, split over the mesh."""
     if not experiment.base:
-        return None
-    params = dsvla_jax.policy.load(Path(experiment.base), mesh).variables["params"]
+        return {}
+    folder = Path(experiment.base)
+    if is_imported(folder):
+        return load_for_model(folder, experiment.model, mesh, frozen=experiment.regime == "lora")
+    params = dsvla_jax.policy.load(folder, mesh).variables["params"]
     expected = jax.eval_shape(lambda: initialize(experiment.model, jax.random.key(0)))
-    require_same_shapes(params, expected["params"], Path(experiment.base))
-    return params
+    require_same_shapes(params, expected["params"], folder)
+    return {"params": params}
 
 
 def prepare_run_folder(run: Path, experiment: Experiment, resume: bool) -> None:

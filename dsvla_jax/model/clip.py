@@ -18,6 +18,9 @@ from dsvla_jax.model.partition import constrain
 
 Array = jax.Array
 
+# Short names of jax.checkpoint_policies.
+REMAT_POLICIES = {"full": "nothing_saveable", "dots": "dots_with_no_batch_dims_saveable"}
+
 
 def quick_gelu(x: Array) -> Array:
     """x sigmoid(1.702 x), CLIP's approximation of GELU."""
@@ -63,7 +66,8 @@ class VisionBlock(nn.Module):
 def over_layers(block, config: ModelConfig, layers: int, in_axes: Any = nn.broadcast) -> Any:
     """``block`` scanned over ``layers``: its variables get a leading layers axis; rematerialised as the config says."""
     if config.remat != "none":
-        policy = jax.checkpoint_policies.dots_with_no_batch_dims_saveable if config.remat == "dots" else None
+        name = REMAT_POLICIES.get(config.remat, config.remat)
+        policy = getattr(jax.checkpoint_policies, name)
         block = nn.remat(block, prevent_cse=False, policy=policy)
     return nn.scan(
         block,

@@ -197,8 +197,11 @@ class ModelConfig:
     visual_prompt: the projection of "adapter".
     lora: None for no adapters.
     dtype: of matrix products and activations. Parameters, norms, softmax, rotations and logits are always float32.
-    remat: what the backward pass computes again, a layer at a time: "none", "full" (everything) or "dots" (all but
-        the results of products with weights).
+    base_dtype: of the matrices of frozen towers. "same": as dtype. "bfloat16": also where dtype is float32. "int8":
+        the kernels of their layers in 8 bits with a scale for each output (`dsvla_jax.model.quantize`).
+    remat: what the backward pass computes again, a layer at a time: "none", "full" (everything), "dots" (all but the
+        results of products with weights: jax's dots_with_no_batch_dims_saveable), or that policy or another by its
+        name in jax.checkpoint_policies.
     attention: "by_hand" (two batched products over head-major arrays; the quickest on CPU) or "fused"
         (jax.nn.dot_product_attention).
     scan_unroll: layers per iteration of the loop over layers. Compile time grows with it, loop overhead shrinks.
@@ -212,7 +215,8 @@ class ModelConfig:
     visual_prompt: VisualPromptConfig = VisualPromptConfig()
     lora: LoraConfig | None = None
     dtype: Literal["float32", "bfloat16"] = "float32"
-    remat: Literal["none", "full", "dots"] = "none"
+    base_dtype: Literal["same", "bfloat16", "int8"] = "same"
+    remat: Literal["none", "full", "dots", "dots_saveable", "dots_with_no_batch_dims_saveable"] = "none"
     attention: Literal["by_hand", "fused"] = "by_hand"
     scan_unroll: int = 1
 
@@ -238,6 +242,11 @@ class ModelConfig:
     @property
     def compute_dtype(self) -> jnp.dtype:
         return jnp.dtype(self.dtype)
+
+    @property
+    def frozen_dtype(self) -> jnp.dtype:
+        """Of matrices that do not learn, but for kernels in 8 bits."""
+        return jnp.dtype(jnp.bfloat16) if self.base_dtype == "bfloat16" else self.compute_dtype
 
     @property
     def prompted_layers(self) -> int:

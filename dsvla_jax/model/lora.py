@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import traverse_util
 
 from dsvla_jax.model.config import LoraConfig
+from dsvla_jax.model.quantize import SCALE, dequantize
 
 Array = jax.Array
 Initializer = Any
@@ -36,7 +37,8 @@ def _adapter_init(kind: str) -> Initializer:
 class LoraDense(nn.Module):
     """y = x W + b + (alpha / rank) x A B over the last axis of x.
 
-    The adapter is used when the variables hold one; merged weights have none, and run through the same module.
+    The adapter is used when the variables hold one; merged weights have none, and run through the same module. So is
+    the scale of a kernel in 8 bits.
     ``adapted=False`` leaves it out for one call.
     """
 
@@ -55,6 +57,8 @@ class LoraDense(nn.Module):
         x = x.reshape(-1, inputs).astype(self.dtype)
         kernel = self.param("kernel", self.kernel_init, (inputs, self.features), jnp.float32)
         y = x @ kernel.astype(self.dtype)
+        if self.has_variable("params", SCALE):
+            y = y * self.get_variable("params", SCALE).astype(self.dtype)
         if self.use_bias:
             bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
             y = y + bias.astype(self.dtype)
@@ -69,7 +73,7 @@ class LoraDense(nn.Module):
 
 
 def _add_adapters(params: Mapping, adapters: Mapping, scale: float) -> dict:
-    flat: dict[tuple, Any] = dict(traverse_util.flatten_dict(params))
+    flat: dict[tuple, Any] = dict(traverse_util.flatten_dict(dequantize(params)))
     flat_adapters: dict[tuple, Any] = dict(traverse_util.flatten_dict(adapters))
     for path in flat_adapters:
         if path[-1] != "a":

@@ -52,7 +52,7 @@ def logical_axes(path: tuple[str, ...]) -> tuple[str | None, ...]:
     kernel = _KERNELS.get(layer, ("embed", None))
     # An adapter's matrices have one long side: over all of the mesh that a kernel's two sides are split over.
     a, b = ("adapter" if side == "hidden" else side for side in kernel)
-    by_name = {"kernel": kernel, "a": (a, None), "b": (None, b)}
+    by_name = {"kernel": kernel, "kernel_scale": (kernel[1],), "a": (a, None), "b": (None, b)}
     return by_name.get(name) or _PARAMETERS.get(name, ())
 
 

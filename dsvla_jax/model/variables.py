@@ -31,7 +31,10 @@ def split_variables(variables: Variables, regime: str) -> tuple[Variables, Varia
 def narrow_frozen(frozen: Variables, dtype: jnp.dtype) -> Variables:
     """The frozen variables with those that the model only ever reads in ``dtype`` kept in it: no result changes."""
     flat = traverse_util.flatten_dict(frozen)
-    narrow = {path: leaf.astype(dtype) if path[-1] in MATRICES else leaf for path, leaf in flat.items()}
+    narrow = {
+        path: leaf.astype(dtype) if path[-1] in MATRICES and leaf.dtype != jnp.int8 else leaf
+        for path, leaf in flat.items()
+    }
     return traverse_util.unflatten_dict(narrow)
 
 

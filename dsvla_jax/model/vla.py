@@ -13,6 +13,7 @@ import numpy as np
 from dsvla_jax.model.clip import Projector, VisionTower
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.llama import KVCache, LayerPrompts, Llama, PromptTokens
+from dsvla_jax.model.quantize import quantize
 from dsvla_jax.model.visual_prompt import VisualPrompt
 from dsvla_jax.types import ModelInputs
 
@@ -130,6 +131,8 @@ def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Arra
     variables = dict(jax.jit(VLA(config).init)(key, inputs))
     if number_values is not None:
         variables["params"] = embed_numbers(variables["params"], language, number_values)
+    if config.base_dtype == "int8":
+        variables["params"] = quantize(variables["params"])
     return variables
 
 

@@ -47,7 +47,8 @@ class Experiment:
     regime: Literal["full", "lora"] = "full"
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
     base: str = ""
-    """A finished run whose parameters are the frozen base of the `lora` regime; empty: random from the seed."""
+    """A finished run, or a folder of imported weights (docs/weights.md), whose parameters come in the place of random
+    ones: the frozen base of the `lora` regime. Empty: all are random from the seed."""
     tokenizer: str = ""
     """A folder with the language model's vocabulary; empty: the words of the task suite."""
     steps: int = 1000
@@ -66,6 +67,11 @@ class Experiment:
     def __post_init__(self) -> None:
         if self.regime == "lora" and self.model.lora is None:
             raise UserError("regime: 'lora' needs adapters, but model.lora is None; give the config a LoraConfig")
+        if self.regime == "full" and self.model.base_dtype != "same":
+            raise UserError(
+                f"model.base_dtype: {self.model.base_dtype!r} is for frozen weights, but regime 'full' trains all; "
+                "use regime 'lora', or base_dtype 'same'"
+            )
 
 
 _converter = cattrs.Converter(forbid_extra_keys=True)

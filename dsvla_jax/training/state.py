@@ -36,18 +36,18 @@ def initial_state(
     experiment: Experiment,
     number_values: np.ndarray | None,
     optimizer: optax.GradientTransformation,
-    params: Variables | None = None,
+    base: Variables | None = None,
 ) -> tuple[TrainState, Variables]:
-    """State and frozen variables at step 0: random by the seed, with ``params`` in the place of random ones if given.
+    """State and frozen variables at step 0: random by the seed, the towers of ``base`` in the place of random ones.
 
     Pure: `make_sharded` makes every leaf where it lives, and none of them is ever whole on one device.
     """
     variables = initialize(experiment.model, jax.random.key(experiment.seed), number_values)
-    if params is not None:
-        variables["params"] = params
+    for collection, towers in (base or {}).items():
+        variables[collection] = {**variables[collection], **towers}
     trainable, frozen = split_variables(variables, experiment.regime)
     state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
-    return state, narrow_frozen(frozen, experiment.model.compute_dtype)
+    return state, narrow_frozen(frozen, experiment.model.frozen_dtype)
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:

@@ -7,11 +7,15 @@ from typing import Any
 import cattrs
 import jax
 import numpy as np
+from jax.sharding import Mesh, NamedSharding
 
 from dsvla_jax.checkpoints import CheckpointError
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
+from dsvla_jax.model.partition import shardings
+from dsvla_jax.model.quantize import SCALE, TOWERS, is_quantized, quantize_kernel
+from dsvla_jax.model.variables import MATRICES
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.weights.folder import create_weights, describe_weights, restore_weights
+from dsvla_jax.weights.folder import DESCRIPTION, create_weights, describe_weights, restore_weights
 from dsvla_jax.weights.llama_adapter import read_adapter
 from dsvla_jax.weights.sources import read_language, read_vision
 from dsvla_jax.weights.tensors import WeightsError
@@ -24,6 +28,8 @@ VARIABLES = {
     "projector": "params/projector",
     "lora": "lora/language",
 }
+# What the sizes of a tower are called in a ModelConfig, where that is another name.
+NAMES_IN_MODEL = {"projector": "visual_prompt"}
 # What is trained further is not rounded.
 TRAINED = ("projector", "lora")
 
@@ -92,6 +98,11 @@ def read_towers(folder: Path) -> Towers:
         raise CheckpointError(f"{folder}: not weights of this version: {details}; import them again") from error
 
 
+def present_towers(towers: Towers) -> list[str]:
+    """The names of those that have params in the folder."""
+    return [name for name in ("language", "vision", "projector") if getattr(towers, name) is not None]
+
+
 def backbone_shapes(folder: Path) -> dict[str, Any]:
     """The variables in a folder, {"params": by tower, and "lora" if there are any}, as float32 ShapeDtypeStructs."""
     towers = read_towers(folder)
@@ -103,8 +114,7 @@ def backbone_shapes(folder: Path) -> dict[str, Any]:
         lora=towers.lora,
     )
     variables = jax.eval_shape(lambda: initialize(config, jax.random.key(0)))
-    present = [name for name in ("language", "vision", "projector") if getattr(towers, name) is not None]
-    shapes = {"params": {name: variables["params"][name] for name in present}}
+    shapes = {"params": {name: variables["params"][name] for name in present_towers(towers)}}
     return shapes if towers.lora is None else {**shapes, "lora": variables["lora"]}
 
 
@@ -115,3 +125,61 @@ def load_backbones(folder: Path, like: Any = None) -> dict[str, Any]:
     Raises CheckpointError where the folder does not hold them.
     """
     return restore_weights(folder, backbone_shapes(folder) if like is None else like)
+
+
+def is_imported(folder: Path) -> bool:
+    """Whether a folder is one that `import_backbones` wrote."""
+    return (folder / DESCRIPTION).is_file()
+
+
+def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -> dict[str, Any]:
+    """The variables in a folder for a model of these sizes, split over the mesh.
+
+    frozen: whether the towers will not learn, so that their matrices have the dtype of a frozen base.
+    What the folder does not hold is not there: it stays as the model initialises it. Kernels that the model keeps in 8
+    bits are converted one after the other. Raises CheckpointError naming the fields of the config that differ.
+    """
+    towers = read_towers(folder)
+    if problems := _differences(towers, model):
+        raise CheckpointError(f"{folder}: weights of another model: {'; '.join(problems)}; change the config's values")
+    full = dataclasses.replace(model, base_dtype="same")
+    variables = jax.eval_shape(lambda: initialize(full, jax.random.key(0)))
+    like: dict[str, Any] = {"params": {name: variables["params"][name] for name in present_towers(towers)}}
+    if towers.lora is not None:
+        like["lora"] = {"language": variables["lora"]["language"]}
+    where = shardings(like, mesh)
+
+    def placed(path: Any, leaf: Any, sharding: NamedSharding) -> jax.ShapeDtypeStruct:
+        keys = [key.key for key in path]
+        narrow = keys[1] in TOWERS and keys[0] == "params" and keys[-1] in MATRICES
+        dtype = model.frozen_dtype if narrow and frozen else leaf.dtype
+        return jax.ShapeDtypeStruct(leaf.shape, dtype, sharding=sharding)
+
+    def convert(path: str, array: jax.Array) -> dict[str, jax.Array]:
+        _, *keys = path.split("/")
+        if model.base_dtype != "int8" or not is_quantized(tuple(keys)):
+            return {path: array}
+        kernel, scale = jax.jit(quantize_kernel)(array)
+        return {path: kernel, f"{path.rsplit('/', 1)[0]}/{SCALE}": scale}
+
+    return restore_weights(folder, jax.tree_util.tree_map_with_path(placed, like, where), convert)
+
+
+def _differences(towers: Towers, model: ModelConfig) -> list[str]:
+    """Each field of the model's config whose value is another one in the folder."""
+    pairs = {"language": model.language, "vision": model.vision}
+    if towers.projector is not None:
+        if model.fusion != "adapter":
+            return [f"model.fusion: the config says {model.fusion!r}, its projection is of 'adapter'"]
+        pairs["projector"] = model.visual_prompt
+    if towers.lora is not None:
+        if model.lora is None or "language" not in model.lora.towers:
+            return ["model.lora: the config has no adapters in the language model, the folder has"]
+        pairs["lora"] = dataclasses.replace(model.lora, towers=towers.lora.towers, init=towers.lora.init)
+    return [
+        f"model.{NAMES_IN_MODEL.get(name, name)}.{field}: the config says {value!r}, the folder {found!r}"
+        for name, config in pairs.items()
+        if (stored := getattr(towers, name)) is not None
+        for field, value in vars(config).items()
+        if value != (found := getattr(stored, field))
+    ]

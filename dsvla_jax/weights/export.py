@@ -73,6 +73,8 @@ def export_run(run: Path, out: Path, model: ModelConfig, tokenizer: Tokenizer, o
     if not towers:
         raise UserError(f"{run}: this run has no adapters: export its whole models with --merged")
     if options.merged:
+        if model.base_dtype == "int8":
+            raise UserError(f"{run}: its base is in 8 bits, no model to publish; export the adapters, without --merged")
         try:
             require_mergeable(tree)
         except ValueError as error:

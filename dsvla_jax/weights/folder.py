@@ -7,7 +7,7 @@ params/             an orbax checkpoint of a PyTree, its arrays in zarr chunks
 import contextlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -80,18 +80,26 @@ def describe_weights(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"{file}: not JSON ({error}); import the weights again") from error
 
 
-def restore_weights(folder: Path, like: Any) -> Any:
+def _keep(path: str, array: jax.Array) -> dict[str, jax.Array]:
+    return {path: array}
+
+
+def restore_weights(folder: Path, like: Any, convert: Callable[[str, jax.Array], dict[str, jax.Array]] = _keep) -> Any:
     """The parameters of a folder, with the structure, shapes, dtypes and shardings of ``like``.
 
     A device is given its shard and no more. A host reads the chunks of its own devices' shards, an array at a time.
+    convert: from the path and values of each array to what is kept of it, by path.
     Raises CheckpointError where structure or shapes differ.
     """
     stored = {
         array.name: ts.open(_spec(array), open=True).result() for array in (folder / PARAMS).iterdir() if array.is_dir()
     }
-    tree = traverse_util.unflatten_dict(stored, sep=".")
-    require_same_shapes(tree, like, folder)
-    return jax.tree.map(_restore_array, tree, like)
+    require_same_shapes(traverse_util.unflatten_dict(stored, sep="."), like, folder)
+    restored: dict[str, jax.Array] = {}
+    leaves: dict[str, Any] = traverse_util.flatten_dict(like, sep="/")
+    for path, leaf in leaves.items():
+        restored |= convert(path, _restore_array(stored[path.replace("/", ".")], leaf))
+    return traverse_util.unflatten_dict(restored, sep="/")
 
 
 def _restore_array(store: Any, like: jax.ShapeDtypeStruct) -> jax.Array:

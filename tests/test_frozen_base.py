@@ -1,0 +1,211 @@
+"""What training starts from: imported weights in a model, the dtypes of a frozen base, and what stays in float32."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import train
+from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.errors import UserError
+from dsvla_jax.model.clip import REMAT_POLICIES
+from dsvla_jax.model.config import LoraConfig, ModelConfig
+from dsvla_jax.model.lora import merge_lora
+from dsvla_jax.model.partition import make_sharded
+from dsvla_jax.model.quantize import dequantize, quantize, quantize_kernel
+from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.sharding import MeshConfig, make_mesh
+from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step, model_inputs
+from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
+from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
+
+GOLDEN = Path(__file__).parent / "golden"
+VALUES = np.full(VOCABULARY, np.nan, np.float32)
+MESH = MeshConfig(data=1)
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory):
+    out = tmp_path_factory.mktemp("imported") / "base"
+    import_backbones(GOLDEN / "llama_sharded", out)
+    return out
+
+
+def experiment_on(imported: Path, **changes: Any) -> Experiment:
+    """Adapters on the imported decoder, and on a random vision tower."""
+    small = small_experiment(regime="lora", base=str(imported), mesh=MESH)
+    model = dataclasses.replace(small.model, language=read_towers(imported).language, **changes)
+    return dataclasses.replace(small, model=model)
+
+
+def start(experiment: Experiment):
+    mesh = make_mesh(experiment.mesh, jax.devices()[:1])
+    values = np.full(experiment.model.language.vocab_size, np.nan, np.float32)
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+
+    def make(base):
+        return initial_state(experiment, values, optimizer, base)
+
+    return make_sharded(make, mesh, train.base_variables(experiment, mesh))
+
+
+@pytest.mark.parametrize("base_dtype", ["same", "bfloat16"])
+def test_training_starts_from_imported_weights(imported, base_dtype):
+    experiment = experiment_on(imported, base_dtype=base_dtype)
+    state, frozen = start(experiment)
+    language = load_backbones(imported)["params"]["language"]
+    dtype = jnp.dtype("bfloat16" if base_dtype == "bfloat16" else "float32")
+
+    def check(path, mine, theirs):
+        matrix = path[-1].key in ("kernel", "embedding", "output")
+        assert mine.dtype == (dtype if matrix else jnp.float32)
+        np.testing.assert_array_equal(mine, theirs.astype(mine.dtype))
+
+    jax.tree_util.tree_map_with_path(check, frozen["params"]["language"], language)
+    random = initialize(experiment.model, jax.random.key(experiment.seed))
+    same = jax.tree.map(lambda a, b: np.array_equal(a, b), state.trainable["lora"], random["lora"])
+    assert all(jax.tree.leaves(same)), "what the folder does not hold is random by the seed"
+
+
+def test_a_base_of_other_sizes_names_the_fields(imported):
+    experiment = experiment_on(imported)
+    language = dataclasses.replace(experiment.model.language, width=32, rope_theta=5.0)
+    other = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, language=language))
+    with pytest.raises(
+        CheckpointError, match=r"language.width: the config says 32, the folder 16; .*rope_theta: .* 5.0"
+    ):
+        start(other)
+
+
+def test_adapters_of_the_base_need_adapters_in_the_config(tmp_path):
+    source = GOLDEN / "original"
+    import_backbones(
+        source / "llama", tmp_path / "base", source / "clip.pt", adapter=source / "adapter.pth", adapter_heads=3
+    )
+    towers = read_towers(tmp_path / "base")
+    assert towers.vision is not None
+    assert towers.projector is not None
+    model = ModelConfig(
+        vision=towers.vision,
+        language=towers.language,
+        fusion="adapter",
+        visual_prompt=towers.projector,
+        lora=LoraConfig(),
+    )
+    small = small_experiment(regime="lora", base=str(tmp_path / "base"), mesh=MESH)
+    with pytest.raises(CheckpointError, match=r"model.lora.rank: the config says 16, the folder 2"):
+        start(dataclasses.replace(small, model=model))
+    state, _ = start(dataclasses.replace(small, model=dataclasses.replace(model, lora=LoraConfig(rank=2, alpha=2.0))))
+    gate = load_backbones(out)["params"]["projector"]["gate"]
+    assert np.abs(gate).min() > 0
+    np.testing.assert_array_equal(state.trainable["params"]["projector"]["gate"], gate)
+
+
+def test_eight_bits_are_within_half_a_step_and_zero_stays_zero():
+    kernel = np.random.default_rng(0).normal(size=(3, 50, 20)).astype(np.float32) * np.geomspace(1e-6, 1e3, 20)
+    kernel[1, :, 4] = 0
+    values, scale = quantize_kernel(jnp.asarray(kernel, jnp.float32))
+    assert values.dtype == jnp.int8
+    restored = np.asarray(values, np.float64) * np.asarray(scale)[:, None]
+    assert (np.abs(restored - kernel) <= 0.501 * np.asarray(scale)[:, None]).all()
+    assert not restored[1, :, 4].any()
+    np.testing.assert_allclose(np.abs(restored).max(1), np.abs(kernel).max(1), rtol=1e-6)
+
+
+def test_a_model_with_eight_bit_kernels_is_the_model_with_their_values():
+    """Same logits, gradients of adapters, and merged weights; the frozen towers take little more than a quarter."""
+    model = dataclasses.replace(small_experiment().model, base_dtype="int8")
+    experiment = dataclasses.replace(small_experiment(regime="lora"), model=model)
+    variables = initialize(model, jax.random.key(0))
+    full = {**variables, "params": dequantize(variables["params"])}
+    inputs = model_inputs({k: jnp.asarray(v) for k, v in random_batch(experiment).items()}, experiment.encoding)
+
+    @jax.jit
+    def run(params, lora):
+        def loss(lora):
+            logits: Any = VLA(model).apply({"params": params, "lora": lora}, inputs)
+            return jnp.square(logits).mean(), logits
+
+        (_, logits), gradients = jax.value_and_grad(loss, has_aux=True)(lora)
+        return logits, gradients
+
+    expected, actual = run(full["params"], variables["lora"]), run(variables["params"], variables["lora"])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5), actual, expected)
+    adapters = jax.tree.map(lambda leaf: leaf + 0.01, variables["lora"])
+    assert model.lora is not None
+    merged, wanted = (merge_lora({**tree, "lora": adapters}, model.lora) for tree in (variables, full))
+    jax.tree.map(np.testing.assert_array_equal, merged, wanted)
+
+    def kernel_bytes(tree):
+        layers = [tree["params"][tower]["layers"] for tower in ("vision", "language")]
+        return sum(
+            leaf.nbytes
+            for path, leaf in jax.tree_util.tree_leaves_with_path(layers)
+            if "kernel" in jax.tree_util.keystr(path[-1:])
+        )
+
+    # Four bytes a scale beside 32 to 128 rows of one byte.
+    assert kernel_bytes(variables) < 0.30 * kernel_bytes(full)
+
+
+def test_eight_bit_base_trains_from_imported_weights(imported):
+    experiment = experiment_on(imported, base_dtype="int8")
+    state, frozen = start(experiment)
+    expected = quantize(load_backbones(imported)["params"] | {"vision": {}})["language"]
+    jax.tree.map(np.testing.assert_array_equal, frozen["params"]["language"], expected)
+    with pytest.raises(UserError, match=r"base_dtype: 'int8' is for frozen weights, but regime 'full'"):
+        dataclasses.replace(experiment, regime="full")
+
+
+PRECISE = {"exp", "log", "sin", "cos", "rsqrt", "logsumexp", "reduce_max", "div"}
+
+
+def equations(jaxpr):
+    """Every equation of a program, those of its loops and branches too."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for value in equation.params.values():
+            for inner in value if isinstance(value, tuple | list) else (value,):
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from equations(inner)
+
+
+@pytest.mark.parametrize("fusion", ["prefix", "adapter"])
+def test_bfloat16_where_it_is_safe_and_float32_where_it_matters(fusion):
+    """Products take bfloat16; norms, softmax, rotations and the loss are float32 through forward and backward pass."""
+    small = small_experiment(regime="lora")
+    model = dataclasses.replace(small.model, dtype="bfloat16", fusion=fusion)
+    experiment = dataclasses.replace(small, model=model)
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state, frozen = jax.eval_shape(lambda: initial_state(experiment, VALUES, optimizer))
+    step = make_train_step(experiment, VLA(model), optimizer, NO_NUMBERS)
+    batch = {name: jax.ShapeDtypeStruct(value.shape, value.dtype) for name, value in random_batch(experiment).items()}
+    program = list(equations(jax.make_jaxpr(step)(state, frozen, batch).jaxpr))
+
+    def dtypes(equation):
+        return {
+            variable.aval.dtype for variable in equation.invars if jnp.issubdtype(variable.aval.dtype, jnp.floating)
+        }
+
+    found = {equation.primitive.name for equation in program}
+    assert found >= {"exp", "log", "rsqrt", "sin", "cos", "dot_general"}
+    for equation in program:
+        if equation.primitive.name in PRECISE:
+            assert jnp.bfloat16 not in dtypes(equation), equation
+    products = [equation for equation in program if equation.primitive.name == "dot_general"]
+    narrow = [equation for equation in products if dtypes(equation) == {jnp.dtype(jnp.bfloat16)}]
+    assert len(narrow) > 0.6 * len(products)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(state.trainable))
+
+
+def test_remat_policies_are_those_of_jax():
+    names = set(get_args(get_type_hints(ModelConfig)["remat"])) - {"none"}
+    assert len(names) > 2
+    for name in names:
+        assert callable(getattr(jax.checkpoint_policies, str(REMAT_POLICIES.get(name, name))))
