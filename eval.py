@@ -22,6 +22,7 @@ import dsvla_jax.policy
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.compile_times import first_use
 from dsvla_jax.errors import UserError
+from dsvla_jax.model.decode import Decoding
 from dsvla_jax.policy import Policy
 from dsvla_jax.report import (
     EpisodeResult,
@@ -59,6 +60,8 @@ class Options:
     """Metres of uniform noise an axis on every keypoint (paper, section 4.3: up to 0.1)."""
     shift: tuple[str, ...] = ()
     """Test conditions unlike those of training (paper, Table 4): instance, position, background, camera."""
+    choice: Literal["greedy", "expected"] = "greedy"
+    """Take the most probable integer of each number, or the one nearest to its mean."""
     seed: int = 0
     skip_finished: bool = False
     """Leave the tasks as they are that have been evaluated since the last training."""
@@ -82,7 +85,7 @@ def main(options: Options) -> None:
     missing = [name for name in tasks if name not in {result.task for result in kept}]
     results = kept
     if missing:
-        policy = dsvla_jax.policy.load(options.run)
+        policy = dsvla_jax.policy.load(options.run, decoding=Decoding(options.choice))
         for name in missing:
             endings = evaluate_task(policy, experiment, name, episodes, options)
             save_strips(file, name, endings)
@@ -106,8 +109,9 @@ def results_file(run: Path, options: Options) -> Path:
     """Where the results of these conditions are kept; the physics alone name the plain ones."""
     noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
     shifts = "".join(f"-{name}" for name in check_shifts(options.shift))
+    choice = f"-{options.choice}" if options.choice != "greedy" else ""
     seed = f"-seed-{options.seed}" if options.seed else ""
-    return run / "eval" / f"{options.physics}{noise}{shifts}{seed}.jsonl"
+    return run / "eval" / f"{options.physics}{noise}{shifts}{choice}{seed}.jsonl"
 
 
 def other_physics(physics: str) -> str:

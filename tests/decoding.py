@@ -59,7 +59,7 @@ def check_against_the_full_forward_pass(
             one = jax.tree.map(lambda x, b=b: jnp.repeat(x[b : b + 1], most, axis=0), prompts)
             one = dataclasses.replace(one, text_tokens=jnp.asarray(rows), text_mask=jnp.ones(rows.shape, bool))
             logits: Any = np.asarray(forward(variables, one), np.float64)[:, len(text) - 1 :]
-            log_probs = np.array([_log_probability(slot, tokens, logits[i]) for i, tokens in enumerate(slot.tokens)])
+            log_probs = np.array([log_probability(slot, tokens, logits[i]) for i, tokens in enumerate(slot.tokens)])
             np.testing.assert_allclose(np.exp(log_probs).sum(), 1, rtol=1e-4)
             if k % 8 == 6 and not any(chosen[-3:]):
                 log_probs[-slot.low] = -np.inf
@@ -73,7 +73,7 @@ def check_against_the_full_forward_pass(
             text += [*slot.tokens[best], *grammar.templates[k + 1]]
 
 
-def _log_probability(slot: NumberSlot, tokens: tuple[int, ...], logits: np.ndarray) -> float:
+def log_probability(slot: NumberSlot, tokens: tuple[int, ...], logits: np.ndarray) -> float:
     """Of an integer written as ``tokens``: each among all that may stand there, then any that ends the number."""
     total, sentences = 0.0, [(*number, end) for number in slot.tokens for end in slot.ends]
     for place in range(len(tokens) + 1):

@@ -1,0 +1,67 @@
+"""A policy with the tokenizer of a language model: from observation to action, and through a run folder."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.model.vla import initialize
+from dsvla_jax.policy import BATCH_SIZES, Policy, full_size, load, save_policy_config
+from dsvla_jax.types import Camera, Observation
+from tests.serving import PROMPTS, observation, tiny_policy
+from tests.vocabularies import small_tokenizer
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    """A policy whose tokenizer splits digits."""
+    small, tokenizer = tiny_policy(), small_tokenizer("sentencepiece")
+    encoding = dataclasses.replace(small.config.encoding, max_text_length=200)
+    language = dataclasses.replace(small.config.model.language, vocab_size=tokenizer.vocab_size)
+    config = dataclasses.replace(
+        small.config, encoding=encoding, model=dataclasses.replace(small.config.model, language=language)
+    )
+    variables = jax.jit(lambda: jax.tree.map(lambda x: 3.0 * x, initialize(config.model, jax.random.key(0))))()
+    return Policy(config, variables, tokenizer)
+
+
+def batch(size: int) -> tuple[Observation, list[str], np.ndarray]:
+    requests = [observation(seed) for seed in range(size)]
+    stacked: Any = {name: np.stack([request[name] for request in requests]) for name in requests[0] if name != "prompt"}
+    camera = Camera(stacked["intrinsics"], stacked["world_from_camera"])
+    observed = Observation(stacked["rgb"], stacked["depth"], camera, stacked["pose"], stacked["gripper_open"])
+    return observed, [PROMPTS[seed % len(PROMPTS)] for seed in range(size)], stacked["keypoints"][:, :, 0]
+
+
+def test_filling_a_batch_up_changes_no_action(policy):
+    five, eight = policy.decide(*batch(5)), policy.decide(*batch(8))
+    assert len(five.texts) == 5
+    assert five.texts == eight.texts[:5]
+    assert len(set(eight.texts)) > 1
+    np.testing.assert_array_equal(five.action.pose, eight.action.pose[:5])
+    assert five.log_probs.shape == five.entropies.shape == (5, 1, 8)
+    np.testing.assert_allclose(five.log_probs, eight.log_probs[:5], atol=1e-4)
+    for b, text in enumerate(five.texts):
+        action = policy.codec.decode(parse_answer(text, 1, "compact"))
+        np.testing.assert_allclose(five.action.pose[b], action.pose, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(five.action.pose[..., 3:], axis=-1), 1, atol=1e-5)
+
+
+def test_few_sizes_are_compiled():
+    assert all(full_size(size) == size for size in BATCH_SIZES)
+    assert len({full_size(size) for size in range(1, 129)}) == len(BATCH_SIZES)
+    assert [full_size(size) for size in (3, 20, 129, 300)] == [4, 25, 256, 384]
+
+
+def test_a_run_folder_keeps_the_tokenizer(policy, tmp_path):
+    checkpoints = RunCheckpoints(tmp_path)
+    checkpoints.save(1, policy.variables, {"count": np.zeros(1)}, {"position": 0})
+    checkpoints.close()
+    save_policy_config(tmp_path, policy.config, policy.tokenizer)
+    again = load(tmp_path)
+    assert again.tokenizer == policy.tokenizer
+    assert again.act(*batch(8))[1] == policy.act(*batch(8))[1]
