@@ -80,7 +80,7 @@ def known_answers(run: Path, episodes: int) -> list[Known]:
         keypoints = np.asarray(environment.keypoints(state))
         for i, instruction in enumerate(environment.instructions(state, np.arange(episodes))):
             one = jax.tree.map(lambda x, i=i: x[i], seen)
-            (answer,) = answer_batch(policy, [Question(instruction, one, keypoints[i, :, 0])], 1)
+            (answer,) = answer_batch(policy, [Question(instruction, one, keypoints[i, :, 0])])
             request = {
                 "prompt": instruction,
                 "rgb": one.rgb,

@@ -111,11 +111,13 @@ class Policy:
         instructions: Sequence[str],
         keypoints: np.ndarray | None,
         key: Array | None = None,
+        prompt_tokens: int | None = None,
     ) -> Decision:
         """The next key pose of every robot of a batch. It is well-formed whatever the weights are.
 
         observation: with a leading axis B of any size; pose (B, A, 7). keypoints: float32 (B, A, 3), the active one of
-        each arm, in metres and the world frame, or None. key: for ``decoding`` that samples.
+        each arm, in metres and the world frame, or None. key: for ``decoding`` that samples. prompt_tokens: the length
+        to pad prompts to, which none may exceed; if not given, the next multiple of `PROMPT_TOKENS`.
         """
         size, poses, grippers = len(instructions), np.asarray(observation.pose), np.asarray(observation.gripper_open)
         encoded = [
@@ -123,7 +125,7 @@ class Policy:
             for i, text in enumerate(instructions)
         ]
         tokens, masks = (np.stack(column) for column in zip(*encoded, strict=True))
-        longest = -(-int(masks.sum(axis=1).max()) // PROMPT_TOKENS) * PROMPT_TOKENS
+        longest = prompt_tokens or -(-int(masks.sum(axis=1).max()) // PROMPT_TOKENS) * PROMPT_TOKENS
         tokens, masks = tokens[:, :longest], masks[:, :longest]
         if full_size(size) > size:
             # Others of the batch have no influence, so any will do to fill it up.

@@ -90,6 +90,6 @@ def running(server_of: Any) -> Iterator[tuple[PolicyServer, int]]:
 
 
 def small_server(policy: Policy | None = None, **options: Any) -> PolicyServer:
-    """A server of 32 x 32 pixels, one arm and batches of at most 4."""
-    limits = Limits(**{"batch": 4, "message_seconds": 1.0, **options.pop("limits", {})})
+    """A server of 32 x 32 pixels, one arm and batches of at most 2."""
+    limits = Limits(**{"batch": 2, "message_seconds": 1.0, **options.pop("limits", {})})
     return PolicyServer(policy or tiny_policy(), [(SIZE, SIZE)], [1], limits, **options)

@@ -8,6 +8,7 @@ import socket
 import struct
 import time
 
+import jax
 import msgpack
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.geometry.cameras import front_camera, unproject
 from dsvla_jax.perception.keypoints import Sighting
-from dsvla_jax.serving.batching import answer_batch, batch_sizes
+from dsvla_jax.serving.batching import answer_batch
 from dsvla_jax.serving.client import PolicyClient, ServerError
 from dsvla_jax.serving.messages import MAX_CONTAINERS, MessageError, pack, unpack
 from dsvla_jax.serving.requests import BadRequest, parse_request
@@ -60,7 +61,7 @@ def expected_text(server, policy, seed: int) -> str:
     """What the policy answers by itself, without a server, to the first request of an episode."""
     request = parse_request(observation(seed), server.expected)
     question, _ = asyncio.run(server._question(request, Session()))
-    return answer_batch(policy, [question], 1)[0].text
+    return answer_batch(policy, [question])[0].text
 
 
 def assert_same(got, expected) -> None:
@@ -194,10 +195,20 @@ def test_answers_are_never_crossed(running_server, policy):
     assert max(batch for replies in answers for _, batch in replies) > 1
 
 
-def test_sizes_of_batches_are_powers_of_two_up_to_the_largest():
-    assert batch_sizes(1) == (1,)
-    assert batch_sizes(12) == (1, 2, 4, 8, 12)
-    assert batch_sizes(16) == (1, 2, 4, 8, 16)
+def test_no_request_waits_for_a_compiler(running_server, caplog):
+    """Batches of every size, and prompts of every length, run what was compiled before the server was ready."""
+    _, port = running_server
+    prompts = ["light", "turn on the light", "lift the red ball " * 4, "press the button"]
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+
+        def ask_often(seed: int) -> None:
+            with PolicyClient(port=port) as client:
+                for prompt in prompts:
+                    client.infer({**observation(seed), "prompt": prompt})
+
+        with concurrent.futures.ThreadPoolExecutor(7) as robots:
+            list(robots.map(ask_often, range(7)))
+    assert [record.message for record in caplog.records if "ompil" in record.message] == []
 
 
 def test_an_arm_that_has_come_near_its_keypoint_is_sent_to_the_next(client):

@@ -69,7 +69,8 @@ def locate(sighting: Sighting, depth: np.ndarray, camera: Camera) -> Sighting:
     rows, columns = (slice(max(0, at - MARGIN), at + MARGIN + 1) for at in (v, u))
     around = depth[rows, columns][sighting.mask[rows, columns]]
     distance = np.median(around[np.isfinite(around) & (around > 0)])
-    point = np.asarray(unproject_pixels(*map(jnp.float32, (u, v, distance)), camera))
+    pixel_and_depth = (jnp.float32(u), jnp.float32(v), jnp.float32(distance))
+    point = np.asarray(unproject_pixels(*pixel_and_depth, camera))
     return dataclasses.replace(sighting, point=point, pixel=pixel)
 
 

@@ -1,4 +1,4 @@
-"""Micro-batching: requests that wait at the same moment are answered together, in batches of sizes compiled before."""
+"""Micro-batching: requests that wait at the same moment are answered together."""
 
 import asyncio
 import dataclasses
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from dsvla_jax.geometry.cameras import front_camera
-from dsvla_jax.policy import Policy
+from dsvla_jax.policy import BATCH_SIZES, Policy
 from dsvla_jax.types import TABLE_HEIGHT, Observation
 
 
@@ -30,11 +30,15 @@ class Question:
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """The next key pose of one robot: pose float32 (A, 7), gripper_open float32 (A,), and the text that says it."""
+    """The next key pose of one robot: pose float32 (A, 7), gripper_open float32 (A,), and the text that says it.
+
+    log_probs: A lists of 8, of each number of the text.
+    """
 
     pose: np.ndarray
     gripper_open: np.ndarray
     text: str
+    log_probs: list[list[float]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,23 +50,31 @@ class Timing:
     batch: int
 
 
-AnswerBatch = Callable[[Sequence[Question], int], Sequence[Answer]]
-
-
 def batch_sizes(largest: int) -> tuple[int, ...]:
-    """1, 2, 4, ... and ``largest``: what is compiled. Padding to the next of them at most doubles the work."""
-    return (*(2**i for i in range((largest - 1).bit_length())), largest)
+    """Of the sizes to which a policy fills up batches, those up to ``largest``."""
+    return tuple(size for size in BATCH_SIZES if size <= largest)
 
 
-def answer_batch(policy: Policy, questions: Sequence[Question], size: int) -> list[Answer]:
-    """Answers at most ``size`` questions of one shape, as a batch of ``size`` padded with the first of them."""
-    padded = [*questions, *[questions[0]] * (size - len(questions))]
-    observation = jax.tree.map(lambda *leaves: np.stack(leaves), *[question.observation for question in padded])
+def prompt_length(policy: Policy, arms: int, instruction_tokens: int) -> int:
+    """Tokens of a prompt with numbers of the most digits and an instruction of so many tokens; at most the policy's."""
+    pose = np.tile(
+        np.array([*policy.codec.low[:2], policy.codec.high[2], -0.5, -0.5, -0.5, 0.5], np.float32), (arms, 1)
+    )
+    _, mask = policy.encode_prompt("", pose, np.ones(arms, np.float32), pose[:, :3])
+    return min(policy.config.encoding.max_text_length, int(mask.sum()) + instruction_tokens)
+
+
+def answer_batch(policy: Policy, questions: Sequence[Question], prompt_tokens: int | None = None) -> list[Answer]:
+    """Answers questions of one shape together, their prompts padded to ``prompt_tokens``."""
+    observation = jax.tree.map(lambda *leaves: np.stack(leaves), *[question.observation for question in questions])
     with_keypoints = policy.config.encoding.use_keypoints
-    keypoints = np.stack([np.asarray(question.keypoints) for question in padded]) if with_keypoints else None
-    action, texts = policy.act(observation, [question.instruction for question in padded], keypoints)
-    poses, grippers = np.asarray(action.pose), np.asarray(action.gripper_open)
-    return [Answer(poses[i], grippers[i], texts[i]) for i in range(len(questions))]
+    keypoints = np.stack([np.asarray(question.keypoints) for question in questions]) if with_keypoints else None
+    instructions = [question.instruction for question in questions]
+    decision = policy.decide(observation, instructions, keypoints, prompt_tokens=prompt_tokens)
+    poses, grippers = np.asarray(decision.action.pose), np.asarray(decision.action.gripper_open)
+    return [
+        Answer(poses[i], grippers[i], text, decision.log_probs[i].tolist()) for i, text in enumerate(decision.texts)
+    ]
 
 
 def blank_question(arms: int, height: int, width: int) -> Question:
@@ -83,11 +95,11 @@ class MicroBatcher:
     """Answers questions in the order of their arrival, all that wait and have one shape together.
 
     No question is held back for company: a batch forms out of what arrives while the one before is being answered.
-    ``answer`` runs in a thread of its own, so that connections stay alive; ``sizes`` are those it is compiled for.
+    ``answer`` runs in a thread of its own, so that connections stay alive. largest: most questions of a batch.
     """
 
-    def __init__(self, answer: AnswerBatch, sizes: Sequence[int]):
-        self._answer, self._sizes = answer, sizes
+    def __init__(self, answer: Callable[[Sequence[Question]], Sequence[Answer]], largest: int):
+        self._answer, self._largest = answer, largest
         self._waiting: list[tuple[Question, asyncio.Future[tuple[Answer, Timing]], float]] = []
         self._arrived = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="policy")
@@ -108,10 +120,9 @@ class MicroBatcher:
                 self._arrived.clear()
                 await self._arrived.wait()
                 continue
-            size = next(size for size in self._sizes if size >= len(batch))
             started = time.monotonic()
             try:
-                answers = await loop.run_in_executor(self._thread, self._answer, [item[0] for item in batch], size)
+                answers = await loop.run_in_executor(self._thread, self._answer, [item[0] for item in batch])
             except Exception as error:
                 # Whatever went wrong, those who wait are told, and the next batch has its chance.
                 for _, future, _ in batch:
@@ -127,7 +138,7 @@ class MicroBatcher:
         """Removes the next batch from the queue, and those who no longer wait."""
         waiting = [item for item in self._waiting if not item[1].done()]
         shape = waiting[0][0].shape if waiting else ()
-        batch = [item for item in waiting if item[0].shape == shape][: self._sizes[-1]]
+        batch = [item for item in waiting if item[0].shape == shape][: self._largest]
         taken = {id(item) for item in batch}
         self._waiting = [item for item in waiting if id(item) not in taken]
         return batch

@@ -26,7 +26,16 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import KeypointTracker, Segmenter
 from dsvla_jax.perception.phrases import TABLE, ObjectPhrases, phrases_for
 from dsvla_jax.policy import Policy
-from dsvla_jax.serving.batching import Answer, MicroBatcher, Question, Timing, answer_batch, batch_sizes, blank_question
+from dsvla_jax.serving.batching import (
+    Answer,
+    MicroBatcher,
+    Question,
+    Timing,
+    answer_batch,
+    batch_sizes,
+    blank_question,
+    prompt_length,
+)
 from dsvla_jax.serving.messages import pack, unpack
 from dsvla_jax.serving.metrics import Metrics
 from dsvla_jax.serving.requests import FIELDS, OPTIONAL_FIELDS, BadRequest, Expected, Request, parse_request
@@ -45,6 +54,8 @@ class Limits:
     """Connections at a time."""
     batch: int = 16
     """Robots answered together at most."""
+    instruction_tokens: int = 64
+    """Of the longest instruction. All prompts are padded to it, since another length would compile again."""
     request_seconds: float = 30.0
     """From a request to its answer."""
     message_seconds: float = 10.0
@@ -86,8 +97,8 @@ class PolicyServer:
         self.expected = Expected(tuple(image_sizes), tuple(arms), policy.codec)
         self.metrics = Metrics()
         self._policy, self._token, self._name = policy, token, name
-        self._sizes = batch_sizes(self.limits.batch)
-        self._batcher = MicroBatcher(lambda questions, size: answer_batch(policy, questions, size), self._sizes)
+        self._prompt_tokens = {n: prompt_length(policy, n, self.limits.instruction_tokens) for n in arms}
+        self._batcher = MicroBatcher(self._answer, batch_sizes(self.limits.batch)[-1])
         self._perception, self._perception_thread = perception, ThreadPoolExecutor(1, thread_name_prefix="perception")
         self._ready = asyncio.Event()
         self._clients = 0
@@ -102,6 +113,7 @@ class PolicyServer:
             "reply": {
                 "actions": "float32 (1, A * 8): the next key pose, x y z qx qy qz qw gripper_open of each arm",
                 "text": "the policy's answer",
+                "log_probs": "of each of its numbers, 8 an arm",
                 "keypoint": "the active keypoint of each arm, metres, world frame, or None",
                 "reached": "how many keypoints each arm has reached",
             },
@@ -141,15 +153,19 @@ class PolicyServer:
             self.metrics.ready.set(1)
             yield server
 
+    def _answer(self, questions: Sequence[Question]) -> list[Answer]:
+        return answer_batch(self._policy, questions, self._prompt_tokens[questions[0].shape[0]])
+
     async def _warm_up(self) -> None:
         # From the largest on: what does not fit into memory shows first.
-        log.info("compiling for batches of %s", ", ".join(map(str, reversed(self._sizes))))
+        sizes = batch_sizes(self.limits.batch)[::-1]
+        log.info("compiling for batches of %s", ", ".join(map(str, sizes)))
         for arms in self.expected.arms:
             for height, width in self.expected.image_sizes:
-                for size in reversed(self._sizes):
+                for size in sizes:
                     started = time.monotonic()
                     question = blank_question(arms, height, width)
-                    await asyncio.to_thread(answer_batch, self._policy, [question], size)
+                    await asyncio.to_thread(self._answer, [question] * size)
                     log.info(
                         "%d arm(s), %d x %d pixels, batch of %d: compiled in %.1f s",
                         *(arms, height, width, size, time.monotonic() - started),
@@ -260,9 +276,15 @@ class PolicyServer:
         observation = request.observation
         pose, gripper_open = np.asarray(observation.pose), np.asarray(observation.gripper_open)
         try:
-            self._policy.encode_prompt(request.instruction, pose, gripper_open, keypoints)
+            _, mask = self._policy.encode_prompt(request.instruction, pose, gripper_open, keypoints)
         except ValueError as error:
             raise BadRequest(f"prompt: {error}") from error
+        tokens, most = int(mask.sum()), self._prompt_tokens[len(pose)]
+        if tokens > most:
+            raise BadRequest(
+                f"prompt: {tokens} tokens with pose and keypoints are more than the {most} that the server is compiled "
+                "for; shorten it, or start the server with more --instruction-tokens"
+            )
         return Question(request.instruction, observation, keypoints), reached
 
     async def _all_keypoints(self, request: Request, session: Session) -> np.ndarray:
@@ -300,6 +322,7 @@ def _reply_map(
     return {
         "actions": np.concatenate([answer.pose, answer.gripper_open[:, None]], axis=-1).reshape(1, -1),
         "text": answer.text,
+        "log_probs": answer.log_probs,
         "keypoint": None if question.keypoints is None else question.keypoints.tolist(),
         "reached": None if reached is None else reached.tolist(),
         "server_timing": server_timing,
