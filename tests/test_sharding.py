@@ -23,7 +23,7 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import MESH_AXES, shardings
 from dsvla_jax.model.variables import join_variables, narrow_frozen, split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh
+from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh, part_of_process
 from dsvla_jax.training.state import initial_state, make_optimizer, model_inputs
 from tests.sharded_training import batches, tiny_experiment
 
@@ -60,12 +60,16 @@ def curves_on(runs: dict[str, tuple[str, int, int]], *more: str) -> dict[str, li
     return dict(zip(runs, losses(start(8, *options, *more)), strict=True))
 
 
-def curves_of_processes(*more: str) -> list[list[float]]:
-    """The losses that two processes of 4 devices each report."""
+def free_address() -> str:
+    """An address that nobody listens on."""
     with socket() as free:
         free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    options = ["--meshes", "2,2,2", "--devices", "0", "--accumulation", "1", "--coordinator", address, *more]
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def curves_of_processes(*more: str) -> list[list[float]]:
+    """The losses that two processes of 4 devices each report."""
+    options = ["--meshes", "2,2,2", "--devices", "0", "--accumulation", "1", "--coordinator", free_address(), *more]
     processes = [start(4, *options, "--process", str(index), "--processes", "2") for index in range(2)]
     return [losses(process)[0] for process in processes]
 
@@ -151,7 +155,7 @@ def test_narrowing_the_frozen_base_changes_nothing():
     experiment = tiny_experiment("adapter", points=False)
     experiment = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, dtype="bfloat16"))
     trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0)), "lora")
-    batch = batches(experiment)[0]
+    batch: Any = batches(experiment)[0]
 
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def logits(frozen):
@@ -179,6 +183,26 @@ def test_sizes_of_a_mesh(config, devices, expected):
     else:
         with pytest.raises(UserError, match=expected):
             config.shape(devices)
+
+
+@pytest.mark.parametrize(
+    ("processes", "expected"),
+    [
+        ([[0], [0], [1], [1]], (1, 2)),
+        ([[0], [1], [0], [1]], (1, 2)),  # the hosts of a torus
+        ([[0, 0], [1, 1]], (1, 2)),
+        ([[0, 1], [0, 1]], (0, 1)),  # both hold all rows, and read the same
+        ([[0, 1], [2, 3]], (0, 2)),
+        ([[0], [0], [0], [1]], None),
+        ([[0, 1], [0, 0]], None),
+    ],
+)
+def test_which_part_of_a_batch_process_1_reads(processes, expected):
+    if expected is None:
+        with pytest.raises(UserError, match="cannot share a batch in equal parts"):
+            part_of_process(np.array(processes), 1)
+    else:
+        assert part_of_process(np.array(processes), 1) == expected
 
 
 def test_a_batch_that_does_not_divide_is_an_error_with_sizes_that_do():

@@ -75,16 +75,26 @@ def batch_part(mesh: Mesh, batch_size: int, accumulation: int = 1) -> BatchPart:
             f"batch_size: {batch_size} does not divide over {parts} parts (mesh data {mesh.shape['data']} x fsdp "
             f"{mesh.shape['fsdp']}){times}; use --batch-size {near}, or another --mesh"
         )
-    rows = batch_sharding(mesh).addressable_devices_indices_map((batch_size,)).values()
-    bounds = [index[0].indices(batch_size)[:2] for index in rows if index is not None]
-    start, stop = min(low for low, _ in bounds), max(high for _, high in bounds)
-    size = stop - start
-    if size != sum(high - low for low, high in set(bounds)) or start % size or batch_size % size:
+    processes = np.vectorize(lambda device: device.process_index)(mesh.devices)
+    index, count = part_of_process(processes.reshape(parts, -1), jax.process_index())
+    return BatchPart(index, count, batch_size // count)
+
+
+def part_of_process(processes: np.ndarray, process: int) -> tuple[int, int]:
+    """Which part of every batch a process reads, and of how many: (index, count).
+
+    processes: int (rows, copies), the process that each row of the batch lives in; copies differ along `tensor`. The
+        rows of one process need not be neighbours: on a torus of chips those of a host rarely are.
+    Raises UserError where the processes' rows are neither the same nor apart, or are not equally many.
+    """
+    rows = {int(one): frozenset(np.nonzero((processes == one).any(axis=1))[0].tolist()) for one in np.unique(processes)}
+    parts = sorted(set(rows.values()), key=min)
+    if len({len(part) for part in parts}) > 1 or sum(map(len, parts)) != len(processes):
         raise UserError(
-            f"mesh: the examples of one process are not one equal part of the batch on {dict(mesh.shape)}; "
-            "use sizes of data and fsdp of which each process holds a whole block"
+            "mesh: the processes cannot share a batch in equal parts on it; choose sizes of fsdp and tensor that "
+            "divide the devices of one process, or are multiples of them"
         )
-    return BatchPart(start // size, batch_size // size, size)
+    return parts.index(rows[process]), len(parts)
 
 
 def put_batch(batch: dict[str, np.ndarray], mesh: Mesh) -> dict[str, jax.Array]:

@@ -1,0 +1,217 @@
+"""Compiles the training step and the decoding step for a slice of chips, and says what they would take there."""
+
+import dataclasses
+import math
+import re
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding
+
+from dsvla_jax.encoding.encode import encode_observation
+from dsvla_jax.encoding.grammar import build_answer_grammar
+from dsvla_jax.encoding.number_targets import number_rows
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
+from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
+from dsvla_jax.model.decode import decode_actions
+from dsvla_jax.model.partition import shardings
+from dsvla_jax.model.variables import join_variables
+from dsvla_jax.model.vla import VLA
+from dsvla_jax.training.chips import Chip, Slice
+from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.flops import prefill_flops, training_flops
+from dsvla_jax.training.hlo import program_cost
+from dsvla_jax.training.sharding import batch_part, batch_sharding, make_mesh
+from dsvla_jax.training.state import (
+    initial_state,
+    jit_train_step,
+    make_optimizer,
+    make_train_step,
+    observation_from_batch,
+)
+from dsvla_jax.types import ModelInputs
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What one compiled program takes on each chip. Bytes and FLOPs are those of one chip and one run.
+
+    held: bytes of what stays in memory by kind. temporary: bytes while it runs; None where the compiler gave up
+        because they do not fit (peak is then what it says it would need).
+    flops: of matrix products in the compiled program, loops by their rounds. counted_flops: by hand, `flops.py`.
+    traffic: of main memory, an upper estimate. collectives: by kind, see `hlo.Cost`.
+    seconds: (all three overlap perfectly, none does) at the chip's published peaks.
+    """
+
+    program: str
+    topology: str
+    mesh: dict[str, int]
+    examples: int
+    held: dict[str, int]
+    temporary: int | None
+    peak: int
+    fits: bool
+    flops: int
+    counted_flops: int
+    traffic: int
+    collectives: dict[str, int]
+    seconds: tuple[float, float]
+    compile_seconds: float
+    unknown_loops: int = 0
+
+
+def planning_tokenizer(experiment: Experiment) -> Tokenizer:
+    """The experiment's vocabulary where its folder is there; otherwise a small one in its place, of which an integer is
+    one token. Nothing but the few numbers of an answer depends on it.
+    """
+    folder = Path(experiment.tokenizer)
+    return load_tokenizer(folder) if experiment.tokenizer and folder.exists() else WordTokenizer(vocabulary(()))
+
+
+def plan_training(experiment: Experiment, where: Slice, examples: int) -> Plan:
+    """The training step with so many examples a chip. Raises UserError where the mesh does not suit the slice."""
+    mesh = make_mesh(experiment.mesh, where.devices)
+    experiment = dataclasses.replace(experiment, batch_size=examples * len(where.devices))
+    batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
+    state, frozen, optimizer = _abstract_state(experiment, mesh)
+    numbers = number_rows(planning_tokenizer(experiment), experiment.encoding.style)
+    step = make_train_step(experiment, VLA(experiment.model), optimizer, numbers.targets(experiment.soft_target_sigma))
+    arguments = {"state": state, "frozen base": frozen, "batch": _abstract_batch(experiment, mesh)}
+    held = {
+        "frozen base": _bytes(frozen),
+        "trainable": _bytes(state.trainable),
+        "optimizer": _bytes(state.optimizer),
+        "batch": _bytes(arguments["batch"]),
+    }
+    counted = sum(training_flops(experiment).values()) * examples
+    lowered = jit_train_step(step, state, mesh).lower(*arguments.values())
+    return _plan("training step", lowered, where, mesh, examples, held, counted)
+
+
+def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
+    """Observations to actions of one arm, with so many examples a chip."""
+    mesh = make_mesh(experiment.mesh, where.devices)
+    experiment = dataclasses.replace(experiment, batch_size=examples * len(where.devices))
+    batch_part(mesh, experiment.batch_size)
+    state, frozen, _ = _abstract_state(experiment, mesh)
+    grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
+    names = ("rgb", "depth", "intrinsics", "world_from_camera", "text_tokens", "text_mask")
+    batch = {name: leaf for name, leaf in _abstract_batch(experiment, mesh).items() if name in names}
+
+    def decode(trainable: Any, frozen: Any, batch: Any) -> Any:
+        with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
+            picture = encode_observation(observation_from_batch(batch), experiment.encoding)
+            inputs = ModelInputs(**picture, text_tokens=batch["text_tokens"], text_mask=batch["text_mask"])
+            return decode_actions(VLA(experiment.model), join_variables(trainable, frozen), inputs, grammar)
+
+    held = {"frozen base": _bytes(frozen), "trainable": _bytes(state.trainable), "batch": _bytes(batch)}
+    counted = sum(prefill_flops(experiment).values()) * examples
+    lowered = jax.jit(decode).lower(state.trainable, frozen, batch)
+    return _plan("decoding", lowered, where, mesh, examples, held, counted)
+
+
+def held_bytes(experiment: Experiment, mesh: Mesh) -> int:
+    """Bytes a chip of parameters and optimizer: what must fit before anything is computed."""
+    state, frozen, _ = _abstract_state(experiment, mesh)
+    return _bytes((state, frozen))
+
+
+def roofline(chip: Chip, flops: float, traffic: float, network: float) -> tuple[float, float]:
+    """Seconds if products, memory and network overlap perfectly, and if they do not at all."""
+    parts = (flops / chip.flops, traffic / chip.memory_bandwidth, network / chip.network_bandwidth)
+    return max(parts), sum(parts)
+
+
+def _plan(
+    program: str, lowered: Any, where: Slice, mesh: Mesh, examples: int, held: dict[str, int], counted: int
+) -> Plan:
+    start = time.monotonic()
+    common: dict[str, Any] = {
+        "program": program,
+        "topology": where.name + (" (virtual CPU devices)" if where.virtual else ""),
+        "mesh": dict(mesh.shape),
+        "examples": examples,
+        "held": held,
+        "counted_flops": counted,
+    }
+    try:
+        compiled = lowered.compile()
+    except jax.errors.JaxRuntimeError as error:
+        needed = _needed(str(error))
+        if needed is None:
+            raise
+        seconds = time.monotonic() - start
+        return Plan(
+            **common, temporary=None, peak=needed, fits=False, flops=0, traffic=0, collectives={},
+            seconds=(math.inf, math.inf), compile_seconds=seconds,
+        )  # fmt: skip
+    seconds = time.monotonic() - start
+    memory: Any = compiled.memory_analysis()
+    cost = program_cost(compiled.as_text())
+    peak = (
+        memory.argument_size_in_bytes
+        + memory.output_size_in_bytes
+        - memory.alias_size_in_bytes
+        + memory.temp_size_in_bytes
+        + memory.generated_code_size_in_bytes
+    )
+    return Plan(
+        **common,
+        temporary=memory.temp_size_in_bytes,
+        peak=peak,
+        fits=peak <= where.chip.memory,
+        flops=cost.flops,
+        traffic=cost.traffic,
+        collectives=dict(cost.collectives),
+        seconds=roofline(where.chip, cost.flops, cost.traffic, sum(cost.collectives.values())),
+        compile_seconds=seconds,
+        unknown_loops=cost.unknown_loops,
+    )
+
+
+def _needed(message: str) -> int | None:
+    """Bytes that the TPU compiler says a program would need, from its error."""
+    found = re.search(r"Used ([\d.]+)([KMG]) of [\d.]+[KMG] hbm", message)
+    return int(float(found[1]) * 2 ** {"K": 10, "M": 20, "G": 30}[found[2]]) if found else None
+
+
+def _abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[Any, Any, Any]:
+    """State and frozen variables as shapes with shardings, and the optimizer."""
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+    return *_placed((state, frozen), shardings((state, frozen), mesh)), optimizer
+
+
+def _abstract_batch(experiment: Experiment, mesh: Mesh) -> dict[str, Any]:
+    """The arrays of a batch (see `data_pipelines.samples`) as shapes with shardings."""
+    size, text = experiment.data.image_size, experiment.encoding.max_text_length
+    leaves = {
+        "rgb": ((size, size, 3), jnp.uint8),
+        "depth": ((size, size), jnp.float32),
+        "intrinsics": ((3, 3), jnp.float32),
+        "world_from_camera": ((4, 4), jnp.float32),
+        "text_tokens": ((text,), jnp.int32),
+        "text_mask": ((text,), jnp.bool_),
+        "answer_mask": ((text,), jnp.bool_),
+        "number_rows": ((text,), jnp.int32),
+    }
+    batch = {
+        name: jax.ShapeDtypeStruct((experiment.batch_size, *shape), dtype) for name, (shape, dtype) in leaves.items()
+    }
+    return _placed(batch, jax.tree.map(lambda _: batch_sharding(mesh), batch))
+
+
+def _placed(tree: Any, where: Any) -> Any:
+    return jax.tree.map(lambda leaf, sharding: leaf.update(sharding=sharding), tree, where)
+
+
+def _bytes(tree: Any) -> int:
+    def size(leaf: Any) -> int:
+        sharding: NamedSharding = leaf.sharding
+        return math.prod(sharding.shard_shape(leaf.shape)) * leaf.dtype.itemsize
+
+    return sum(map(size, jax.tree.leaves(tree)))
