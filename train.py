@@ -32,6 +32,7 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
+from dsvla_jax.training.distributed import Watchdog, start_processes
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
@@ -41,7 +42,7 @@ from dsvla_jax.weights.base import is_imported, load_for_model
 PADDING_ROWS = 1024
 
 
-def main(experiment: Experiment, run: Path, resume: bool) -> None:
+def main(experiment: Experiment, run: Path, resume: bool, watchdog: Watchdog) -> None:
     """Trains one experiment into the run folder, or goes on from its newest checkpoint."""
     tokenizer = tokenizer_of(experiment)
     tasks = choose_tasks(experiment.data)
@@ -89,7 +90,9 @@ def main(experiment: Experiment, run: Path, resume: bool) -> None:
     first = int(state.step)
     with Metrics(run, first) as metrics, tqdm(total=experiment.steps, initial=first, unit="step", desc="train") as bar:
         for step in range(first, experiment.steps):
+            watchdog.doing(f"reading data for step {step}")
             batch = put_batch(next(loader), mesh)
+            watchdog.doing(f"computing step {step}")
             if step == first:
                 bar.set_postfix_str("compiling the training step")
             state, step_metrics = train_step(state, frozen, batch)
@@ -185,6 +188,7 @@ def command_line(arguments: list[str]) -> None:
         sys.exit(0 if arguments else 2)
     name, *rest = arguments
     experiment = get_config(name)
+    start_processes()
     configure_jax()
 
     def train(
@@ -199,7 +203,8 @@ def command_line(arguments: list[str]) -> None:
             run: the run folder.
             resume: go on from the newest checkpoint of the run folder; a finished run is left as it is.
         """
-        main(experiment, run, resume)
+        with Watchdog(run / "processes").watching() as watchdog:
+            main(experiment, run, resume, watchdog)
 
     tyro.cli(train, args=rest, prog=f"train.py {name}")
 
