@@ -64,7 +64,7 @@ class SuccessRate:
 def write_results(path: str | os.PathLike, results: Iterable[EpisodeResult]) -> None:
     """One line of JSON an episode. The file appears whole or not at all."""
     lines = [json.dumps(dataclasses.asdict(result), ensure_ascii=False) + "\n" for result in results]
-    _write_whole(Path(path), "".join(lines))
+    write_whole(Path(path), "".join(lines))
 
 
 def read_results(path: str | os.PathLike) -> list[EpisodeResult]:
@@ -211,10 +211,10 @@ def write_report(
         pooled=pooled(rates),
         macro=macro_mean(rates),
         episodes={rate.name: [result for result in results if result.task == rate.name] for rate in rates},
-        pictures={key: _png_data(film_strip(frames)) for key, frames in (strips or {}).items() if len(frames)},
+        pictures={key: png_data(film_strip(frames)) for key, frames in (strips or {}).items() if len(frames)},
         comparison=compare_physics(results, other) if other else None,
     )
-    _write_whole(Path(path), page)
+    write_whole(Path(path), page)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,14 +243,16 @@ def compare_physics(first: Sequence[EpisodeResult], second: Sequence[EpisodeResu
     return Comparison((names[0], names[1]), tasks, [(a, b) for a, b in pairs if a.success != b.success])
 
 
-def _png_data(rgb: np.ndarray) -> str:
+def png_data(rgb: np.ndarray) -> str:
+    """uint8 (H, W, 3), RGB, as a data URI for a page."""
     encoded, data = cv2.imencode(".png", rgb[..., ::-1])
     if not encoded:
         raise ValueError(f"cannot encode an image of shape {rgb.shape} and type {rgb.dtype} as PNG")
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
 
 
-def _write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, text: str) -> None:
+    """Writes a file that appears whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".partial")
     temporary.write_text(text, encoding="utf-8")

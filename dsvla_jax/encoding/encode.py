@@ -79,10 +79,18 @@ def encode_observation(observation: Observation, config: EncodingConfig) -> dict
         point_patches: int32 (B, G). Keyword arguments of ModelInputs.
     """
     image = normalize_image(observation.rgb, config.image_size)
-    batch, height, width = image.shape[0], observation.depth.shape[1], observation.depth.shape[2]
     if not config.use_points:
+        batch = image.shape[0]
         tokens = jnp.zeros((batch, 0, config.points.width), jnp.float32)
         return {"image": image, "point_tokens": tokens, "point_patches": jnp.zeros((batch, 0), jnp.int32)}
+    tokens, _, patches = cloud_tokens(observation, config)
+    return {"image": image, "point_tokens": tokens, "point_patches": patches}
+
+
+def cloud_tokens(observation: Observation, config: EncodingConfig) -> tuple[Array, Array, Array]:
+    """The 3D tokens of a batch: tokens float32 (B, G, D3), their centres (B, G, 3), metres, world frame, and the image
+    patches int32 (B, G) that they are aligned with."""
+    height, width = observation.depth.shape[1:]
     cloud = jax.vmap(
         lambda depth, camera: cloud_from_depth(
             depth, camera, config.workspace_low, config.workspace_high, config.stride
@@ -100,7 +108,7 @@ def encode_observation(observation: Observation, config: EncodingConfig) -> dict
     patches = jax.vmap(lambda one, camera: align_to_patches(one, camera, height, width, config.grid, config.alignment))(
         centers, observation.camera
     )
-    return {"image": image, "point_tokens": tokens, "point_patches": patches}
+    return tokens, centers, patches
 
 
 def normalize_image(rgb: ArrayLike, size: int) -> Array:

@@ -1,0 +1,155 @@
+"""See one episode of a trained run as an HTML page: python -m dsvla_jax.demo RUN [--task lamp_on] [--out demo.html]
+
+For each key pose: the picture with the cloud's 3D tokens and the patches they are aligned with, the keypoints, the
+prompt, the answer with how probable each number was, and where the arm went.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import jinja2
+import numpy as np
+import tyro
+
+import dsvla_jax.policy
+from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
+from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.geometry.cameras import project
+from dsvla_jax.policy import Decision, Policy
+from dsvla_jax.report import mark_targets, png_data, write_whole
+from dsvla_jax.rollout import run_episodes
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.training.experiment import load_experiment
+from dsvla_jax.types import Action, Observation
+
+SHOWN = 480  # pixels a side of a picture on the page
+NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which run, on which episode."""
+
+    run: tyro.conf.Positional[Path]
+    """The run folder that train.py wrote."""
+    task: str = ""
+    """The run's first task if not given."""
+    seed: int = 0
+    """Number of the episode, none of which was demonstrated."""
+    out: Path | None = None
+    """The page; RUN/demo.html if not given."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One key pose: pictures as data URIs, and rows (number, value, probability) for each arm."""
+
+    tokens: str
+    target: str
+    prompt: str
+    answer: str
+    numbers: list[list[tuple[str, str, float]]]
+
+
+def draw_tokens(rgb: np.ndarray, centers: np.ndarray, patches: np.ndarray, camera, grid: int) -> np.ndarray:
+    """The picture, enlarged, with each 3D token's centre (G, 3) joined to the middle of its patch (G,); patches that
+    have tokens are outlined. A token of the workspace's far side is blue, of the near side yellow."""
+    height, width = rgb.shape[:2]
+    picture = cv2.resize(rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST)
+    pixels, depth = (np.asarray(x) for x in project(jnp.asarray(centers), camera))
+    places = (pixels + 0.5) * [SHOWN / width, SHOWN / height]
+    cell = SHOWN / grid
+    for patch in np.unique(patches):
+        row, column = divmod(int(patch), grid)
+        corners = [(round(x * cell), round(y * cell)) for x, y in ((column, row), (column + 1, row + 1))]
+        cv2.rectangle(picture, corners[0], corners[1], (255, 255, 255), 1)
+    near = (depth.max() - depth) / max(float(np.ptp(depth)), 1e-6)
+    for place, patch, closeness in zip(places, patches, near, strict=True):
+        row, column = divmod(int(patch), grid)
+        middle = (round((column + 0.5) * cell), round((row + 0.5) * cell))
+        point = (round(float(place[0])), round(float(place[1])))
+        colour = (round(255 * closeness), round(200 * closeness), round(255 * (1 - closeness)))
+        cv2.line(picture, point, middle, colour, 1, cv2.LINE_AA)
+        cv2.circle(picture, point, 4, colour, -1, cv2.LINE_AA)
+    return picture
+
+
+def draw_keypoints(picture: np.ndarray, keypoints: np.ndarray, camera, image_size: tuple[int, int]) -> np.ndarray:
+    """Crosses, enlarged likewise, at points (N, 3)."""
+    pixels, _ = project(jnp.asarray(keypoints), camera)
+    picture = picture.copy()
+    for place in (np.asarray(pixels) + 0.5) * [SHOWN / image_size[1], SHOWN / image_size[0]]:
+        point = (round(float(place[0])), round(float(place[1])))
+        for colour, thickness in (((0, 0, 0), 4), ((60, 255, 60), 2)):
+            cv2.drawMarker(picture, point, colour, cv2.MARKER_TILTED_CROSS, 18, thickness, cv2.LINE_AA)
+    return picture
+
+
+def describe(policy: Policy, seen: Observation, instruction: str, near: np.ndarray, decision: Decision) -> Step:
+    """One turn of the only robot of a batch. near: the active keypoint of each arm, (A, 3)."""
+    encoding: EncodingConfig = policy.config.encoding
+    one = jax.tree.map(lambda x: np.asarray(x)[0], seen)
+    picture, size = cv2.resize(one.rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST), one.rgb.shape[:2]
+    if encoding.use_points:
+        centers, patches = (np.asarray(x)[0] for x in jax.jit(cloud_tokens, static_argnums=1)(seen, encoding)[1:])
+        picture = draw_tokens(one.rgb, centers, patches, one.camera, encoding.grid)
+    target = np.asarray(decision.action.pose)[0]
+    enlarged = cv2.resize(one.rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST)
+    scale = np.diag([SHOWN / size[1], SHOWN / size[0], 1.0]).astype(np.float32)
+    marked = mark_targets(enlarged, target[:, :3], one.camera.replace(intrinsics=scale @ one.camera.intrinsics))
+    bins = parse_answer(decision.texts[0], len(target), encoding.style)
+    return Step(
+        tokens=png_data(picture),
+        target=png_data(draw_keypoints(marked, near, one.camera, size) if encoding.use_keypoints else marked),
+        prompt=build_prompt(encoding, instruction, one.pose, one.gripper_open, near),
+        answer=decision.texts[0],
+        numbers=[
+            [(name, str(bins[arm, i]), float(np.exp(decision.log_probs[0, arm, i]))) for i, name in enumerate(NUMBERS)]
+            for arm in range(len(target))
+        ],
+    )
+
+
+def main(options: Options) -> None:
+    """Runs the episode and writes the page."""
+    data = load_experiment(options.run / "config.json").data
+    (task,) = select_tasks((options.task,)) if options.task else select_tasks(data.tasks)[:1]
+    policy, environment = dsvla_jax.policy.load(options.run), Environment(task, image_size=data.image_size)
+    print(f"{task}, episode {options.seed}: compiling takes a minute the first time", flush=True)
+    state = environment.reset(episode_keys(0, "eval", task, options.seed, 1))
+    steps: list[Step] = []
+
+    def act(seen: Observation, instructions, near: np.ndarray) -> tuple[Action, list[str]]:
+        decision = policy.decide(seen, instructions, near)
+        steps.append(describe(policy, seen, instructions[0], near[0], decision))
+        print(f"key pose {len(steps)}: {decision.texts[0]}", flush=True)
+        return decision.action, decision.texts
+
+    (ending,) = run_episodes(environment, act, state)
+    template = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
+    ).get_template("demo.html.jinja")
+    page = template.render(
+        task=task,
+        run=str(options.run),
+        seed=options.seed,
+        ending=ending,
+        steps=steps,
+        film=[png_data(cv2.resize(frame, (192, 192), interpolation=cv2.INTER_NEAREST)) for frame in ending.frames],
+    )
+    out = options.out or options.run / "demo.html"
+    write_whole(out, page)
+    print(f"{'success' if ending.success else ending.reason}: {out}")
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        parsed = tyro.cli(Options, prog="python -m dsvla_jax.demo", description=__doc__)
+        configure_jax()
+        main(parsed)
