@@ -21,6 +21,7 @@ from tqdm import tqdm
 import dsvla_jax.policy
 from configs import config_names, get_config
 from data_pipelines.loader import make_loader
+from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.samples import make_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
@@ -34,7 +35,7 @@ from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.training.distributed import Watchdog, start_processes
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
-from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
+from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.weights.base import is_imported, load_for_model
 
@@ -45,8 +46,9 @@ PADDING_ROWS = 1024
 def main(experiment: Experiment, run: Path, resume: bool, watchdog: Watchdog) -> None:
     """Trains one experiment into the run folder, or goes on from its newest checkpoint."""
     tokenizer = tokenizer_of(experiment)
-    tasks = choose_tasks(experiment.data)
-    experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
+    if experiment.oxe is None:
+        tasks = choose_tasks(experiment.data)
+        experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     mesh = make_mesh(experiment.mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     prepare_run_folder(run, experiment, resume)
@@ -55,23 +57,13 @@ def main(experiment: Experiment, run: Path, resume: bool, watchdog: Watchdog) ->
         checkpoints.close()
         print(f"{run} has been trained to step {experiment.steps}: nothing to do")
         return
-    data = experiment.data
-    reader = open_demonstrations(data, tokenizer)
-    sample = make_sampler(data, experiment.encoding, tokenizer)
-    loader = make_loader(
-        reader,
-        sample,
-        batch_size=part.size,
-        seed=experiment.seed,
-        process_index=part.index,
-        process_count=part.count,
-    )
+    loader, samples = open_data(experiment, tokenizer, part)
 
     model = VLA(experiment.model)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
     state, frozen = make_sharded(start, mesh, base_variables(experiment, mesh))
-    report_size(state.trainable, frozen, reader.num_frames)
+    report_size(state.trainable, frozen, samples)
 
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
@@ -82,7 +74,8 @@ def main(experiment: Experiment, run: Path, resume: bool, watchdog: Watchdog) ->
         print(f"resuming {run} at step {restored.step}")
     else:
         save_experiment(run / "config.json", experiment)
-        save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model), tokenizer)
+        displacement = loader.scale if isinstance(loader, OxeLoader) else None
+        save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model, displacement), tokenizer)
         checkpoints.save_base(frozen)
 
     targets = number_rows(tokenizer, experiment.encoding.style).targets(experiment.soft_target_sigma)
@@ -106,6 +99,22 @@ def main(experiment: Experiment, run: Path, resume: bool, watchdog: Watchdog) ->
                 checkpoints.save(done, state.trainable, state.optimizer, loader.get_state())
     checkpoints.close()
     print(f"trained: {run} (evaluate it with: python eval.py {run})")
+
+
+def open_data(experiment: Experiment, tokenizer: Tokenizer, part: BatchPart) -> tuple[Any, int]:
+    """The batches of this process, as an iterator with a position to save, and the number of different samples."""
+    order: dict[str, Any] = {
+        "batch_size": part.size,
+        "seed": experiment.seed,
+        "process_index": part.index,
+        "process_count": part.count,
+    }
+    if experiment.oxe is not None:
+        loader = OxeLoader(experiment.oxe, experiment.encoding, tokenizer, **order)
+        return loader, loader.num_samples
+    reader = open_demonstrations(experiment.data, tokenizer)
+    sample = make_sampler(experiment.data, experiment.encoding, tokenizer)
+    return make_loader(reader, sample, **order), reader.num_frames
 
 
 def tokenizer_of(experiment: Experiment) -> Tokenizer:
@@ -206,7 +215,7 @@ def command_line(arguments: list[str]) -> None:
         with Watchdog(run / "processes").watching() as watchdog:
             main(experiment, run, resume, watchdog)
 
-    tyro.cli(train, args=rest, prog=f"train.py {name}")
+    tyro.cli(train, args=rest, prog=f"train.py {name}", config=(tyro.conf.AvoidSubcommands,))
 
 
 if __name__ == "__main__":

@@ -29,3 +29,34 @@ class DataConfig:
     keypoint_noise_probability: float = 0.5
     colour_variation: float = 0.0
     """Relative strength of the brightness, contrast and colour variation; 0 turns it off."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OxeConfig:
+    """Open X-Embodiment episodes to learn from (docs/data_oxe.md)."""
+
+    folder: str = "data/oxe"
+    """Where the datasets' folders are: a path or a URL."""
+    mixture: tuple[str, ...] = ("oxe_magic_soup_plus_minus",)
+    """A named mixture, or datasets as NAME or NAME=WEIGHT; a weight multiplies the dataset's number of samples."""
+    split: str = "train"
+    target: Literal["relative", "absolute"] = "relative"
+    """relative: displacement from the present pose, binned between its 1 % and 99 % quantiles; absolute: the pose."""
+    horizon: float = 1.0
+    """Seconds from a frame to its target; 0 for the next key frame."""
+    image_size: int = 224
+    """Pixels a side of the square picture."""
+    crop: float = 0.9
+    """Smallest fraction of a picture's sides that a random crop keeps; 1 turns it off."""
+    colour_variation: float = 0.2
+    """Relative strength of the brightness, contrast and saturation variation; 0 turns it off."""
+    window: int = 32
+    """Episodes of each dataset that are open at a time, among whose frames samples are drawn."""
+    streams: int = 8
+    """Parts that episodes are dealt to. As many processes, or a divisor of it, read none of each other's records."""
+    unsupported: Literal["refuse", "leave_out"] = "refuse"
+    """What to do with datasets that do not tell what the target needs."""
+    skip_bad: bool = False
+    """Leave damaged records and pictures out, and list them, instead of stopping."""
+    cache: str = ""
+    """A folder for indices and statistics; empty: beside the data, or the user's cache where that cannot be written."""

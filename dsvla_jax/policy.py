@@ -14,6 +14,7 @@ from flax import struct
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.encoding.displacement import DisplacementScale, displace
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer
@@ -33,6 +34,8 @@ class PolicyConfig:
 
     encoding: EncodingConfig
     model: ModelConfig
+    displacement: DisplacementScale | None = None
+    """The range of answers that say where to go from the present pose; None for answers that are poses."""
 
 
 # Batches are filled up to one of these sizes, so that any size runs without compiling again; beyond, to a multiple of
@@ -136,7 +139,10 @@ class Policy:
             np.asarray(x)[:size] for x in (decoded.integers, decoded.log_probs, decoded.entropies)
         )
         texts = [format_answer(row, self.config.encoding.style) for row in bins]
-        return Decision(jax.vmap(self.codec.decode)(jnp.asarray(bins)), texts, log_probs, entropies)
+        action = jax.vmap(self.codec.decode)(jnp.asarray(bins))
+        if (scale := self.config.displacement) is not None:
+            action = action.replace(pose=jnp.asarray(displace(poses, scale.from_pose(action.pose, self.codec))))
+        return Decision(action, texts, log_probs, entropies)
 
 
 def full_size(size: int) -> int:

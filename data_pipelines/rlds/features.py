@@ -4,6 +4,7 @@ Only the columns that are asked for are converted. Images stay encoded until a s
 Datasets' feature definitions are used; TensorFlow is not.
 """
 
+import dataclasses
 import zlib
 from functools import cache
 from typing import Any
@@ -122,7 +123,9 @@ class RldsEpisode:
 
     def image(self, path: str, step: int) -> np.ndarray:
         """One decoded image: its own dtype, (H, W, C)."""
-        return decode_image(self.encoded(path)[step], self._feature(path), f"{self.where}, step {step}, {path}")
+        return decode_image(
+            self.encoded(path)[step], image_format(self._feature(path)), f"{self.where}, step {step}, {path}"
+        )
 
     def _feature(self, path: str) -> Any:
         if path not in self._features:
@@ -144,28 +147,38 @@ class RldsEpisode:
         return getattr(values, kind).value
 
 
-def decode_image(data: bytes, feature: Any, where: object) -> np.ndarray:
+@dataclasses.dataclass(frozen=True)
+class ImageFormat:
+    """What an Image feature says of its pictures. shape: (H, W, C), None where open."""
+
+    shape: tuple[int | None, ...]
+    dtype: np.dtype
+
+
+def image_format(feature: Any) -> ImageFormat:
+    """The format of an Image feature."""
+    return ImageFormat(tuple(feature.shape), np.dtype(feature.np_dtype))
+
+
+def decode_image(data: bytes, kind: ImageFormat, where: object) -> np.ndarray:
     """The (H, W, C) picture of an Image feature, in its own dtype; RGB order. JPEG or PNG, of 8 or 16 bits.
 
     A float32 Image is a four-channel PNG whose bytes are the numbers', as tfds writes it.
     """
-    shape, dtype = feature.shape, np.dtype(feature.np_dtype)
-    colour = shape[-1] == 3 and dtype == np.uint8
-    flag = cv2.IMREAD_COLOR_RGB if colour else cv2.IMREAD_UNCHANGED
-    picture = None
-    if data:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION if colour else flag)
+    colour = kind.shape[-1] == 3 and kind.dtype == np.uint8
+    flag = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if colour else cv2.IMREAD_UNCHANGED
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flag) if data else None
     if picture is None:
         raise DataError(where, "image", "a JPEG or PNG", f"{len(data)} undecodable bytes", _FIX)
-    if not colour and picture.ndim == 3:
-        picture = cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA if picture.shape[-1] == 4 else cv2.COLOR_BGR2RGB)
-    if dtype == np.float32:
-        picture = np.ascontiguousarray(picture).view(np.float32)
-    picture = picture.reshape(*picture.shape[:2], -1)
-    expected = tuple(shape)
-    fits = all(size in (None, got) for size, got in zip(expected, picture.shape, strict=True))
-    if picture.dtype != dtype or not fits:
-        raise DataError(where, "image", f"{dtype} {expected}", f"{picture.dtype} {picture.shape}", _FIX)
+    if not colour:
+        if picture.ndim == 3:
+            picture = cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA if picture.shape[-1] == 4 else cv2.COLOR_BGR2RGB)
+        if kind.dtype == np.float32:
+            picture = np.ascontiguousarray(picture).view(np.float32)
+        picture = picture.reshape(*picture.shape[:2], -1)
+    fits = all(size in (None, got) for size, got in zip(kind.shape, picture.shape, strict=True))
+    if picture.dtype != kind.dtype or not fits:
+        raise DataError(where, "image", f"{kind.dtype} {kind.shape}", f"{picture.dtype} {picture.shape}", _FIX)
     return picture
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import cattrs
 
-from dsvla_jax.data_config import DataConfig
+from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
@@ -42,6 +42,8 @@ class Experiment:
     encoding: EncodingConfig
     model: ModelConfig
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    oxe: OxeConfig | None = None
+    """Open X-Embodiment episodes to learn from instead of `data`."""
     optimizer: OptimizerConfig = OptimizerConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     regime: Literal["full", "lora"] = "full"

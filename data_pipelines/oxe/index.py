@@ -1,0 +1,197 @@
+"""One pass over a dataset: where its records are, how many samples each holds, and the statistics of their targets.
+
+Only action and state columns are converted; no picture is decoded. The result is kept beside the data and made again
+where the data, the dataset's description or the targets asked for have changed.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from data_pipelines.oxe import dataset as dataset_module
+from data_pipelines.oxe import datasets_converted, datasets_other, datasets_rtx, motion, targets
+from data_pipelines.oxe.dataset import OxeDataset
+from data_pipelines.oxe.targets import make_targets
+from data_pipelines.records import DataError
+from data_pipelines.rlds import files
+from data_pipelines.rlds.build import RldsBuild, Shard, TFRecordFile
+from dsvla_jax.command_line import cache_folder
+from dsvla_jax.data_config import OxeConfig
+
+VERSION = 1
+KEPT_ROWS = 1 << 18
+"""Rows of displacements that quantiles are taken from; of more, evenly spaced ones are kept."""
+QUANTILES = 101
+
+
+@dataclasses.dataclass(frozen=True)
+class Index:
+    """What one pass found.
+
+    shards: paths. offsets: of each TFRecord shard, else None. shard, record, samples: int64 (E,), of the E usable
+    episodes: where each is, and how many samples it gives. quantiles: (101, 6) of all arms' displacements, ascending,
+    or None for absolute targets. bytes: of an average record. left_out: record and reason, of skipped ones.
+    """
+
+    shards: list[str]
+    offsets: list[np.ndarray] | None
+    shard: np.ndarray
+    record: np.ndarray
+    samples: np.ndarray
+    quantiles: np.ndarray | None
+    bytes: float
+    left_out: list[tuple[str, str]]
+
+    @property
+    def num_samples(self) -> int:
+        return int(self.samples.sum())
+
+
+def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True) -> Index:
+    """The index of a split, from its file where that is current."""
+    key = _fingerprint(build, dataset, config)
+    path = _cache_path(build, dataset, config, key)
+    if path.is_file():
+        return _unpack(json.loads(path.read_text()))
+    index = scan(build, dataset, config, progress)
+    if not len(index.samples):
+        reasons = "; ".join(f"{where}: {why}" for where, why in index.left_out[:2])
+        fix = "choose another split, or look at its records" + (f" ({reasons})" if reasons else "")
+        raise DataError(build.folder, f"split {config.split}", "at least one usable episode", "none", fix)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(f".{os.getpid()}.partial")
+    temporary.write_text(json.dumps(_pack(index)) + "\n")
+    os.replace(temporary, path)
+    return index
+
+
+def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True) -> Index:
+    """Reads every record once. Raises DataError at the first bad one, or lists it where `config.skip_bad`."""
+    shards = build.shards(config.split)
+    rows, spacing, left_out = [], 1, []
+    places: list[tuple[int, int, int]] = []
+    offsets: list[np.ndarray] = []
+    seen = size = count = 0
+    total = sum(shard.records for shard in shards)
+    bar = tqdm(total=total, unit="episode", desc=f"index {dataset.name}", disable=not progress, leave=False)
+    for number, shard in enumerate(shards):
+        try:
+            records = build.open_shard(shard)
+            usable = len(records)
+        except DataError as error:
+            _leave_out(error, shard.path, left_out, config)
+            offsets.append(np.zeros(1, np.int64))
+            continue
+        if isinstance(records, TFRecordFile):
+            offsets.append(records.offsets)
+            if not records.is_whole or usable != shard.records:
+                _leave_out(_truncated(shard, usable), shard.path, left_out, config)
+        for record in range(usable):
+            where = f"{shard.path}, record {record}"
+            bar.update()
+            try:
+                data = records.read(record)
+                episode = build.parse(data, where)
+                if dataset.keep is not None and not dataset.keep(episode):
+                    continue
+                made = make_targets(dataset.motion(episode), dataset, config)
+                check_pictures(episode, dataset)
+            except DataError as error:
+                _leave_out(error, where, left_out, config)
+                continue
+            size, count = size + len(data), count + 1
+            if len(made.frame):
+                places.append((number, record, len(made.frame)))
+            if made.displacement is not None:
+                taken = np.arange(seen, seen + len(made.frame)) % spacing == 0
+                rows.append(made.displacement[taken].reshape(-1, 6))
+                seen += len(made.frame)
+                if sum(map(len, rows)) > KEPT_ROWS:
+                    rows, spacing = [np.concatenate(rows)[::2]], 2 * spacing
+        records.close()
+    bar.close()
+    shard_of, record_of, samples = np.array(places, np.int64).reshape(-1, 3).T
+    quantiles = None
+    if rows:
+        quantiles = np.quantile(np.concatenate(rows), np.linspace(0, 1, QUANTILES), axis=0)
+    return Index(
+        shards=[shard.path for shard in shards],
+        offsets=offsets if build.format == "tfrecord" else None,
+        shard=shard_of,
+        record=record_of,
+        samples=samples,
+        quantiles=quantiles,
+        bytes=size / max(count, 1),
+        left_out=left_out,
+    )
+
+
+def check_pictures(episode: Any, dataset: OxeDataset) -> None:
+    """Raises DataError unless the view that is trained on has a picture for every step."""
+    view = main_view(dataset)
+    episode.encoded(f"steps/observation/{dataset.images[view]}")
+
+
+def main_view(dataset: OxeDataset) -> Any:
+    """The view that the policy sees: the primary one, or the wrist's where there is no other."""
+    return "primary" if "primary" in dataset.images else "wrist"
+
+
+def _truncated(shard: Shard, usable: int) -> DataError:
+    fix = "copy it again, or use what is whole with --skip-bad"
+    return DataError(shard.path, "records", f"{shard.records} and no bytes after them", f"{usable} whole ones", fix)
+
+
+def _leave_out(error: DataError, where: str, left_out: list[tuple[str, str]], config: OxeConfig) -> None:
+    if not config.skip_bad:
+        raise error
+    left_out.append((where, str(error).removeprefix(f"{where}: ")))
+
+
+def _fingerprint(build: RldsBuild, dataset: OxeDataset, config: OxeConfig) -> str:
+    """Changes where the files, the features, the code that reads them or the targets change."""
+    code = [dataset_module, datasets_converted, datasets_other, datasets_rtx, motion, targets]
+    parts = [
+        str(VERSION),
+        json.dumps(build.features_json, sort_keys=True),
+        repr([(shard.path, shard.records, _size(shard.path)) for shard in build.shards(config.split)]),
+        *(Path(str(module.__file__)).read_text() for module in code),
+        repr((dataset.name, config.split, config.target, config.horizon, config.skip_bad)),
+    ]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _size(path: str) -> int | None:
+    return files.size_of(path) if files.exists(path) else None
+
+
+def _cache_path(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, key: str) -> Path:
+    name = f"dsvla_index_{dataset.name}_{config.split}_{key[:16]}.json"
+    if config.cache:
+        return Path(config.cache) / name
+    if not files.is_remote(build.folder) and os.access(build.folder, os.W_OK):
+        return Path(build.folder) / name
+    return cache_folder() / "oxe" / name
+
+
+def _pack(index: Index) -> dict[str, Any]:
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return value.tolist()
+        return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+    return {field.name: plain(getattr(index, field.name)) for field in dataclasses.fields(index)}
+
+
+def _unpack(stored: dict[str, Any]) -> Index:
+    arrays = {name: np.array(stored[name], np.int64) for name in ("shard", "record", "samples")}
+    offsets = None if stored["offsets"] is None else [np.array(row, np.int64) for row in stored["offsets"]]
+    quantiles = None if stored["quantiles"] is None else np.array(stored["quantiles"], np.float64)
+    left_out = [(where, why) for where, why in stored["left_out"]]
+    return Index(**{**stored, **arrays, "offsets": offsets, "quantiles": quantiles, "left_out": left_out})

@@ -1,0 +1,116 @@
+"""Batches of a mixture, with the interface of ``data_pipelines.loader``: an iterator with a position to save."""
+
+import dataclasses
+import operator
+import sys
+from collections.abc import Iterator
+from typing import Any, SupportsIndex
+
+import grain
+
+from data_pipelines.loader import Sample
+from data_pipelines.oxe.mixture import ENDLESS, EncodedSample, MixtureSource
+from data_pipelines.oxe.samples import make_batcher
+from data_pipelines.oxe.scale import MixtureScale
+from data_pipelines.records import DataError
+from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding.displacement import DisplacementScale
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.errors import UserError
+
+
+class OxeLoader(Iterator[Sample]):
+    """Endless batches. `scale`: what displacements are binned over, None for absolute targets.
+
+    left_out: records and frames that were skipped so far, and why.
+    """
+
+    def __init__(
+        self,
+        config: OxeConfig,
+        encoding: EncodingConfig,
+        tokenizer: Tokenizer,
+        *,
+        batch_size: int,
+        seed: int,
+        process_index: int = 0,
+        process_count: int = 1,
+        num_threads: int = 4,
+        progress: bool = True,
+    ):
+        """batch_size: of one process; processes take the numbers of the one stream in turns.
+
+        The order depends on `seed` and the config only: not on processes, threads or where a run was interrupted.
+        """
+        self.source = MixtureSource(config, seed, progress)
+        if encoding.use_points:
+            flat = [item.dataset.name for item in self.source.datasets if item.dataset.depth is None]
+            if flat:
+                raise UserError(
+                    f"encoding.use_points: {', '.join(flat)} have no calibrated depth; set it to False, or choose"
+                    " datasets that have"
+                )
+        mixture_scale = MixtureScale(self.source) if config.target == "relative" else None
+        self.scale: DisplacementScale | None = mixture_scale.scale if mixture_scale else None
+        self.left_out = _Reported(self.source.left_out)
+        to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self.left_out.append)
+        batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
+        options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=2 * num_threads)
+        dataset = batches.map(to_batch).to_iter_dataset(options)
+        self._batches: grain.DatasetIterator[Sample] = iter(dataset)
+
+    @property
+    def num_samples(self) -> int:
+        """Of all datasets, each once."""
+        return self.source.num_samples
+
+    def __next__(self) -> Sample:
+        return next(self._batches)
+
+    def get_state(self) -> dict[str, Any]:
+        """JSON: the position, the data that it belongs to, and the scale that a policy un-normalises with."""
+        scale = dataclasses.asdict(self.scale) if self.scale else None
+        return {"position": self._batches.get_state(), "data": repr(self.source), "scale": scale}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Goes on from a position. Raises DataError where the data or the mixture are others than then."""
+        if state.get("data") != repr(self.source):
+            fix = "put the same data back, or start a new run"
+            raise DataError("saved position", "data", str(state.get("data")), repr(self.source), fix)
+        self._batches.set_state(state["position"])
+
+
+class _Batches(grain.sources.RandomAccessDataSource[list[tuple[int, EncodedSample]]]):
+    """Frames by the number of the batch, each with its number in the stream. All processes' parts make a run of it."""
+
+    def __init__(self, source: MixtureSource, size: int, process_index: int, process_count: int):
+        self._source, self._size, self._index, self._count = source, size, process_index, process_count
+
+    def __len__(self) -> int:
+        return ENDLESS
+
+    def __getitem__(self, record_key: SupportsIndex) -> list[tuple[int, EncodedSample]]:
+        first = operator.index(record_key) * self._size * self._count + self._index
+        numbers = range(first, first + self._size * self._count, self._count)
+        return [(number, self._source[number]) for number in numbers]
+
+    def __repr__(self) -> str:
+        # grain keeps this text with an iterator's position, and compares it on the way back.
+        return f"batches of {self._size * self._count} of {self._source!r}"
+
+
+class _Reported(list[tuple[str, str]]):
+    """Tells each entry once, on standard error."""
+
+    def __init__(self, entries: list[tuple[str, str]]):
+        super().__init__()
+        self._seen: set[tuple[str, str]] = set()
+        for entry in entries:
+            self.append(entry)
+
+    def append(self, entry: tuple[str, str]) -> None:
+        if entry not in self._seen:
+            self._seen.add(entry)
+            super().append(entry)
+            print(f"left out ({len(self)}): {entry[0]}: {entry[1]}", file=sys.stderr)

@@ -1,0 +1,214 @@
+"""Datasets opened and mixed: random access to the samples of an endless stream, with pictures still encoded."""
+
+import dataclasses
+import operator
+import threading
+from typing import SupportsIndex
+
+import grain
+import numpy as np
+
+from data_pipelines.oxe.dataset import OxeDataset
+from data_pipelines.oxe.index import Index, load_index, main_view
+from data_pipelines.oxe.order import BlockOrder, deal, schedule
+from data_pipelines.oxe.registry import get_dataset, get_mixture
+from data_pipelines.oxe.targets import Targets, make_targets, why_unsupported
+from data_pipelines.rlds import files
+from data_pipelines.rlds.build import RecordFile, RldsBuild
+from data_pipelines.rlds.features import ImageFormat, RldsEpisode, image_format
+from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.errors import UserError
+
+ENDLESS = 1 << 40
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """intrinsics: float32 (3, 3). world_from_camera: float32 (4, 4). depth: encoded, counts of `depth_unit` metres."""
+
+    intrinsics: np.ndarray
+    world_from_camera: np.ndarray
+    depth_unit: float
+    depth: bytes
+    depth_format: ImageFormat
+
+
+@dataclasses.dataclass(frozen=True)
+class EncodedSample:
+    """One frame with its picture encoded. pose, target_pose: (A, 7). displacement: (A, 6). grippers: (A,)."""
+
+    dataset: str
+    where: str
+    instruction: str
+    picture: bytes
+    format: ImageFormat
+    camera: Camera | None
+    pose: np.ndarray
+    gripper_open: np.ndarray
+    target_pose: np.ndarray | None
+    displacement: np.ndarray | None
+    target_gripper: np.ndarray
+
+
+class OpenDataset:
+    """One dataset of the mixture: its build, its index, and its episodes one by one."""
+
+    def __init__(self, dataset: OxeDataset, config: OxeConfig, progress: bool = True):
+        self.dataset, self.config = dataset, config
+        self.build = RldsBuild(_folder_of(dataset, config))
+        self.view = main_view(dataset)
+        self.index: Index = load_index(self.build, dataset, config, progress)
+
+    def read(self, episode: int, open_files: dict[int, RecordFile]) -> list[EncodedSample]:
+        """All samples of an episode."""
+        shard, record = int(self.index.shard[episode]), int(self.index.record[episode])
+        if shard not in open_files:
+            while len(open_files) >= 4:
+                open_files.pop(next(iter(open_files))).close()
+            offsets = None if self.index.offsets is None else self.index.offsets[shard]
+            open_files[shard] = self.build.open_shard(self.build.shards(self.config.split)[shard], offsets)
+        where = f"{self.index.shards[shard]}, record {record}"
+        parsed = self.build.parse(open_files[shard].read(record), where)
+        motion = self.dataset.motion(parsed)
+        return self._samples(parsed, motion.instruction, make_targets(motion, self.dataset, self.config))
+
+    def _samples(self, episode: RldsEpisode, instruction: str, targets: Targets) -> list[EncodedSample]:
+        path = f"steps/observation/{self.dataset.images[self.view]}"
+        pictures, steps = episode.encoded(path), self.dataset.steps(episode)
+        cameras, kind = self._cameras(episode), image_format(self.build.features[path])
+        return [
+            EncodedSample(
+                dataset=self.dataset.name,
+                where=f"{episode.where}, step {steps[frame]}, {path}",
+                instruction=instruction,
+                picture=pictures[steps[frame]],
+                format=kind,
+                camera=cameras[steps[frame]] if cameras else None,
+                pose=targets.pose[i],
+                gripper_open=targets.gripper_open[i],
+                target_pose=None if targets.target_pose is None else targets.target_pose[i],
+                displacement=None if targets.displacement is None else targets.displacement[i],
+                target_gripper=targets.target_gripper[i],
+            )
+            for i, frame in enumerate(targets.frame)
+        ]
+
+    def _cameras(self, episode: RldsEpisode) -> list[Camera]:
+        depth = self.dataset.depth
+        if depth is None:
+            return []
+        intrinsics = episode.column(f"steps/observation/{depth.intrinsics}")
+        poses = np.linalg.inv(episode.column(f"steps/observation/{depth.camera_from_world}").astype(np.float64))
+        path = f"steps/observation/{depth.key}"
+        encoded, kind = episode.encoded(path), image_format(self.build.features[path])
+        return [
+            Camera(intrinsics[i], poses[i].astype(np.float32), depth.unit, encoded[i], kind)
+            for i in range(episode.num_steps)
+        ]
+
+
+class Stream:
+    """One stream's samples of one dataset; at most two blocks of episodes are in memory."""
+
+    def __init__(self, source: OpenDataset, episodes: np.ndarray, window: int, seed: list[int]):
+        self._source, self._episodes = source, episodes
+        self._order = BlockOrder(source.index.samples[episodes], window, seed)
+        self._blocks: dict[tuple[int, int], dict[int, list[EncodedSample]]] = {}
+        self._files: dict[int, RecordFile] = {}
+        self._lock = threading.Lock()
+
+    def sample(self, number: int) -> EncodedSample:
+        """The stream's sample of that number, counted through all epochs."""
+        with self._lock:
+            block, episode, place = self._order.locate(number)
+            if block not in self._blocks:
+                while len(self._blocks) >= 2:
+                    del self._blocks[next(iter(self._blocks))]
+                self._blocks[block] = {}
+            loaded = self._blocks[block]
+            if episode not in loaded:
+                loaded[episode] = self._source.read(int(self._episodes[episode]), self._files)
+            return loaded[episode][place]
+
+
+class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
+    """The endless, shuffled stream of a mixture by sample number; the same whoever reads which numbers.
+
+    Number i belongs to stream i mod `config.streams`. A stream has its own episodes of every dataset.
+    """
+
+    def __init__(self, config: OxeConfig, seed: int, progress: bool = True):
+        self.config, self.seed = config, seed
+        self.datasets, self.weights = open_mixture(config, progress)
+        sizes = np.array([source.index.num_samples for source in self.datasets], float)
+        self.shares = self.weights * sizes / np.sum(self.weights * sizes)
+        window = max(1, -(-config.window // config.streams))
+        self._schedules = [schedule(self.shares, [seed, stream]) for stream in range(config.streams)]
+        # The same for every stream.
+        self._turns = np.bincount(self._schedules[0][0], minlength=len(self.datasets))
+        self._streams = []
+        for number, source in enumerate(self.datasets):
+            dealt = deal(len(source.index.samples), config.streams, [seed, number])
+            if not all(len(episodes) for episodes in dealt):
+                raise UserError(
+                    f"{source.build.folder}: {len(source.index.samples)} usable episodes cannot be dealt to"
+                    f" {config.streams} streams; lower `streams` to that, or leave the dataset out"
+                )
+            made = [Stream(source, episodes, window, [seed, number, i]) for i, episodes in enumerate(dealt)]
+            self._streams.append(made)
+
+    def __len__(self) -> int:
+        return ENDLESS
+
+    def __getitem__(self, record_key: SupportsIndex) -> EncodedSample:
+        place, stream = divmod(operator.index(record_key), self.config.streams)
+        dataset, occurrence = self._schedules[stream]
+        cycle, place = divmod(place, len(dataset))
+        number = int(dataset[place])
+        return self._streams[number][stream].sample(cycle * int(self._turns[number]) + int(occurrence[place]))
+
+    def __repr__(self) -> str:
+        told = [(source.dataset.name, source.index.num_samples) for source in self.datasets]
+        shape = (self.seed, self.config.streams, self.config.window)
+        return f"MixtureSource(datasets={told}, weights={self.weights.tolist()}, seed, streams, window={shape})"
+
+    @property
+    def num_samples(self) -> int:
+        """Of all datasets, each once."""
+        return sum(source.index.num_samples for source in self.datasets)
+
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """Records that were skipped, and why."""
+        return [entry for source in self.datasets for entry in source.index.left_out]
+
+
+def open_mixture(config: OxeConfig, progress: bool = True) -> tuple[list[OpenDataset], np.ndarray]:
+    """The datasets of a mixture, and their weights (D,). Raises UserError where one is missing or cannot be used."""
+    weights = get_mixture(config.mixture)
+    reasons = {name: why_unsupported(get_dataset(name), config) for name in weights}
+    refused = {name: reason for name, reason in reasons.items() if reason}
+    if refused and config.unsupported == "refuse":
+        told = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+        raise UserError(
+            f"mixture: some datasets cannot give {config.target} targets: {told}. Set target to relative,"
+            " choose others, or set unsupported to leave_out"
+        )
+    kept = [name for name in weights if name not in refused]
+    if not kept:
+        raise UserError(f"mixture: no dataset of {', '.join(weights)} can give {config.target} targets")
+    if len({get_dataset(name).frame for name in kept}) > 1 and config.target == "relative":
+        tools = [name for name in kept if get_dataset(name).frame == "tool"]
+        raise UserError(f"mixture: displacements of {', '.join(tools)} are in the tool's frame; train on them alone")
+    return [OpenDataset(get_dataset(name), config, progress) for name in kept], np.array(
+        [weights[name] for name in kept]
+    )
+
+
+def _folder_of(dataset: OxeDataset, config: OxeConfig) -> str:
+    folder = files.join(config.folder, dataset.name)
+    if not files.exists(folder):
+        raise UserError(
+            f"{folder}: no such dataset; copy it there from {dataset.source}, or choose another folder or mixture"
+        )
+    return files.join(folder, dataset.version) if dataset.version else folder

@@ -1,0 +1,102 @@
+"""From encoded frames to the batch that training takes: the same keys as ``data_pipelines.samples``.
+
+The prompt is the one of simulated demonstrations without the keypoint sentence. Where there is no calibrated depth,
+`depth` is one missing pixel and the camera zeros: a policy without 3D tokens reads neither.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from data_pipelines.oxe.mixture import EncodedSample
+from data_pipelines.oxe.scale import MixtureScale
+from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
+from data_pipelines.records import DataError
+from data_pipelines.rlds.features import decode_image
+from data_pipelines.samples import Sample
+from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding.encode import EncodingConfig, encode_text
+from dsvla_jax.encoding.number_targets import number_rows
+from dsvla_jax.encoding.prompts import format_answer, format_prompt
+from dsvla_jax.encoding.text import Tokenizer
+
+
+def make_batcher(
+    config: OxeConfig,
+    encoding: EncodingConfig,
+    tokenizer: Tokenizer,
+    scale: MixtureScale | None,
+    seed: int,
+    leave_out: Callable[[tuple[str, str]], None],
+) -> Callable[[Sequence[tuple[int, EncodedSample]]], Sample | None]:
+    """``batch(numbered frames)``. scale: for relative targets. A frame's variation depends on `seed` and its number.
+
+    leave_out: is told of frames whose picture cannot be decoded where `config.skip_bad`. Such a frame gives its place
+    to its neighbour in the batch; a batch without any other gives None.
+    """
+    numbers = number_rows(tokenizer, encoding.style)
+
+    def text(frame: EncodedSample) -> Sample:
+        poses = np.stack([frame.pose, target_of(frame, encoding, scale)])
+        state, bins = np.asarray(encoding.codec.encode(poses, np.stack([frame.gripper_open, frame.target_gripper])))
+        prompt = format_prompt(frame.instruction, state, None, encoding.style)
+        tokens, mask, answer_mask = encode_text(
+            tokenizer, prompt, format_answer(bins, encoding.style), encoding.max_text_length
+        )
+        rows = np.zeros(len(tokens), np.int32)
+        rows[answer_mask] = numbers.rows(bins)
+        return {"text_tokens": tokens, "text_mask": mask, "answer_mask": answer_mask, "number_rows": rows}
+
+    def batch(frames: Sequence[tuple[int, EncodedSample]]) -> Sample | None:
+        rgb = np.empty((len(frames), config.image_size, config.image_size, 3), np.uint8)
+        rows: list[Sample | None] = []
+        for row, (number, frame) in enumerate(frames):
+            try:
+                rng = np.random.default_rng([seed, number])
+                rows.append({**_picture(frame, rng, config, encoding.use_points, rgb[row]), **text(frame)})
+            except DataError as error:
+                if not config.skip_bad:
+                    raise
+                leave_out((frame.where, str(error).removeprefix(f"{frame.where}: ")))
+                rows.append(None)
+        good = [row for row, sample in enumerate(rows) if sample is not None]
+        if not good:
+            return None
+        chosen = [min(good, key=lambda other: abs(other - row)) for row in range(len(rows))]
+        samples = [rows[row] for row in chosen]
+        stacked = {name: np.stack([sample[name] for sample in samples if sample]) for name in rows[good[0]] or {}}
+        return {"rgb": rgb if len(good) == len(rows) else rgb[chosen], **stacked}
+
+    return batch
+
+
+def target_of(frame: EncodedSample, encoding: EncodingConfig, scale: MixtureScale | None) -> np.ndarray:
+    """(A, 7): the target pose, or the displacement as a pose inside the codec's box."""
+    if frame.displacement is None:
+        assert frame.target_pose is not None
+        return frame.target_pose
+    assert scale is not None
+    return scale.scale.to_pose(scale.to_mixture(frame.dataset, frame.displacement), encoding.codec)
+
+
+def _picture(
+    frame: EncodedSample, rng: np.random.Generator, config: OxeConfig, use_points: bool, rgb: np.ndarray
+) -> Sample:
+    """Writes `rgb` (S, S, 3); returns depth, intrinsics and world_from_camera, which a crop moves along."""
+    picture = decode_image(frame.picture, frame.format, frame.where)
+    height, width = picture.shape[:2]
+    box = random_box(rng, height, width, config.crop) if config.crop < 1 else (0, 0, height, width)
+    picture = crop_resize(picture, box, config.image_size)
+    if config.colour_variation > 0:
+        vary_light(picture, rng, config.colour_variation, rgb)
+    else:
+        rgb[:] = picture
+    depth, intrinsics, pose = np.zeros((1, 1), np.float32), np.zeros((3, 3), np.float32), np.zeros((4, 4), np.float32)
+    if use_points and (camera := frame.camera) is not None:
+        counts = decode_image(camera.depth, camera.depth_format, f"{frame.where}: depth")[..., 0]
+        if counts.shape != (height, width):
+            fix = "only depth of the picture's own size can be used"
+            raise DataError(frame.where, "depth", f"{height} x {width}", f"{counts.shape[0]} x {counts.shape[1]}", fix)
+        depth = crop_resize(counts, box, config.image_size, nearest=True) * np.float32(camera.depth_unit)
+        intrinsics, pose = crop_intrinsics(camera.intrinsics, box, config.image_size), camera.world_from_camera
+    return {"depth": depth, "intrinsics": intrinsics, "world_from_camera": pose}

@@ -1,0 +1,49 @@
+"""The range that displacements are binned over: one for a whole mixture, so that a policy needs no dataset's name."""
+
+import numpy as np
+
+from data_pipelines.oxe.index import QUANTILES
+from data_pipelines.oxe.mixture import MixtureSource
+from dsvla_jax.encoding.displacement import DisplacementScale
+
+LOW, HIGH = round(0.01 * (QUANTILES - 1)), round(0.99 * (QUANTILES - 1))
+
+
+class MixtureScale:
+    """From each dataset's own displacements to the mixture's.
+
+    The mixture's range is the 1 % to 99 % quantile over its metric datasets, each counting as much as its share of
+    samples. Displacements that are not metric are stretched from their own 1 % to 99 % range to that; where no dataset
+    is metric, the range is -1 to 1.
+    """
+
+    def __init__(self, source: MixtureSource):
+        quantiles = [np.asarray(item.index.quantiles) for item in source.datasets]
+        metric = [item.dataset.metric for item in source.datasets]
+        low, high = -np.ones(6), np.ones(6)
+        if any(metric):
+            known = [(rows, share) for rows, share, one in zip(quantiles, source.shares, metric, strict=True) if one]
+            low, high = (np.array([_quantile(known, column, at) for column in range(6)]) for at in (0.01, 0.99))
+        self.scale = DisplacementScale(tuple(map(float, low)), tuple(map(float, high)))
+        self._own = {
+            item.dataset.name: None if one else (rows[LOW], rows[HIGH])
+            for item, rows, one in zip(source.datasets, quantiles, metric, strict=True)
+        }
+
+    def to_mixture(self, dataset: str, displacement: np.ndarray) -> np.ndarray:
+        """(A, 6) of a dataset -> (A, 6) in the mixture's range."""
+        own = self._own[dataset]
+        if own is None:
+            return displacement
+        low, high = np.array(self.scale.low), np.array(self.scale.high)
+        span = np.where(own[1] > own[0], own[1] - own[0], 1.0)
+        fraction = np.where(own[1] > own[0], (displacement - own[0]) / span, 0.5)
+        return low + fraction * (high - low)
+
+
+def _quantile(known: list[tuple[np.ndarray, float]], column: int, at: float) -> float:
+    """Of the distribution that mixes those given by quantiles (101, 6), each with its share."""
+    points = np.unique(np.concatenate([rows[:, column] for rows, _ in known]))
+    levels = np.linspace(0, 1, QUANTILES)
+    passed = sum(share * np.interp(points, rows[:, column], levels) for rows, share in known)
+    return float(np.interp(at, passed / sum(share for _, share in known), points))

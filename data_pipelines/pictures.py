@@ -1,0 +1,54 @@
+"""Crops that take the camera along, and quick photometric variation, on uint8 pictures.
+
+A box is (top, left, height, width) in whole pixels. There is no mirror: a mirrored picture of a robot and of the words
+left and right is not true, whatever its camera says.
+"""
+
+import cv2
+import numpy as np
+
+Box = tuple[int, int, int, int]
+
+
+def random_box(rng: np.random.Generator, height: int, width: int, smallest: float) -> Box:
+    """A box with the picture's own proportions, of `smallest` to all of its sides, anywhere inside."""
+    part = rng.uniform(smallest, 1.0)
+    rows, columns = max(1, round(height * part)), max(1, round(width * part))
+    return int(rng.integers(0, height - rows + 1)), int(rng.integers(0, width - columns + 1)), rows, columns
+
+
+def crop_resize(picture: np.ndarray, box: Box, size: int, nearest: bool = False) -> np.ndarray:
+    """The box of (H, W) or (H, W, 3) as (size, size[, 3]). nearest: for depth, which must not be blended."""
+    top, left, rows, columns = box
+    part = picture[top : top + rows, left : left + columns]
+    if (rows, columns) == (size, size):
+        return np.ascontiguousarray(part)
+    shrinks = rows > 1.5 * size or columns > 1.5 * size
+    mode = cv2.INTER_NEAREST_EXACT if nearest else cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return cv2.resize(part, (size, size), interpolation=mode)
+
+
+def crop_intrinsics(intrinsics: np.ndarray, box: Box, size: int) -> np.ndarray:
+    """float32 (3, 3) of the picture that `crop_resize` makes; pixel (0, 0) is the middle of the first pixel."""
+    top, left, rows, columns = box
+    across, down = size / columns, size / rows
+    moved = np.array(
+        [
+            [across, 0, across * (0.5 - left) - 0.5],
+            [0, down, down * (0.5 - top) - 0.5],
+            [0, 0, 1],
+        ]
+    )
+    return (moved @ intrinsics.astype(np.float64)).astype(np.float32)
+
+
+def vary_light(
+    picture: np.ndarray, rng: np.random.Generator, strength: float, out: np.ndarray | None = None
+) -> np.ndarray:
+    """uint8 (H, W, 3) with brightness, contrast and saturation varied by up to ±strength; into `out` if given."""
+    brightness, contrast, saturation = 1 + rng.uniform(-strength, strength, 3)
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    # All three are linear: (s v + (1 - s) grey) b, moved away from or towards the mean grey by the contrast.
+    gain, mean = brightness * contrast, cv2.mean(grey)[0] * brightness
+    grey = cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)
+    return cv2.addWeighted(picture, saturation * gain, grey, (1 - saturation) * gain, mean * (1 - contrast), out)

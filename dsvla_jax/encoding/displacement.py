@@ -1,0 +1,78 @@
+"""Displacements as poses inside the codec's box, so that the same answer text can say where to go from here.
+
+A displacement is (..., 6): metres, and a rotation vector in radians, both in the base frame: it is added to a position
+and multiplied from the left to a rotation.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dsvla_jax.encoding.codec import PoseCodec
+
+HALF_RANGE_ANGLE = np.pi / 2
+"""Radians that stand for the end of the range of one axis; three ends together stay below a half turn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DisplacementScale:
+    """The range of each component that the bins cover: `low` to `high`, metres and radians.
+
+    A component that does not vary (high = low) is written as the middle and read as `low`.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def __post_init__(self):
+        if len(self.low) != 6 or len(self.high) != 6 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"DisplacementScale: expected six low <= high, got {self.low} and {self.high}")
+
+    def to_pose(self, displacement: ArrayLike, codec: PoseCodec) -> np.ndarray:
+        """(..., 6) -> float32 (..., 7), inside the codec's box; what lies beyond the range is moved to its end."""
+        low, high = np.array(self.low), np.array(self.high)
+        span = np.where(high > low, high - low, 1.0)
+        fraction = np.where(high > low, 2 * (np.asarray(displacement, np.float64) - low) / span - 1, 0.0)
+        fraction = np.clip(fraction, -1.0, 1.0)
+        centre, half = _box(codec)
+        rotation = rotation_vector_to_quaternion(fraction[..., 3:] * HALF_RANGE_ANGLE)
+        return np.concatenate([centre + half * fraction[..., :3], rotation], axis=-1).astype(np.float32)
+
+    def from_pose(self, pose: ArrayLike, codec: PoseCodec) -> np.ndarray:
+        """The inverse of `to_pose`: float32 (..., 7) -> (..., 6)."""
+        pose = np.asarray(pose, np.float64)
+        centre, half = _box(codec)
+        rotation = quaternion_to_rotation_vector(pose[..., 3:]) / HALF_RANGE_ANGLE
+        fraction = np.clip(np.concatenate([(pose[..., :3] - centre) / half, rotation], axis=-1), -1.0, 1.0)
+        low, high = np.array(self.low), np.array(self.high)
+        return np.where(high > low, low + (fraction + 1) / 2 * (high - low), low).astype(np.float32)
+
+
+def displace(pose: ArrayLike, displacement: ArrayLike) -> np.ndarray:
+    """float32 (..., 7): the pose that a displacement (..., 6) leads to from poses (..., 7)."""
+    pose, displacement = np.asarray(pose, np.float64), np.asarray(displacement, np.float64)
+    turn, start = rotation_vector_to_quaternion(displacement[..., 3:]), pose[..., 3:]
+    vector = turn[..., 3:] * start[..., :3] + start[..., 3:] * turn[..., :3] + np.cross(turn[..., :3], start[..., :3])
+    real = turn[..., 3:] * start[..., 3:] - np.sum(turn[..., :3] * start[..., :3], axis=-1, keepdims=True)
+    return np.concatenate([pose[..., :3] + displacement[..., :3], vector, real], axis=-1).astype(np.float32)
+
+
+def rotation_vector_to_quaternion(vector: np.ndarray) -> np.ndarray:
+    """(..., 3) radians -> unit quaternions xyzw (..., 4)."""
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    # sin(a / 2) / a, which is 1 / 2 at 0.
+    return np.concatenate([vector * np.sinc(angle / (2 * np.pi)) / 2, np.cos(angle / 2)], axis=-1)
+
+
+def quaternion_to_rotation_vector(quaternion: np.ndarray) -> np.ndarray:
+    """Unit quaternions xyzw (..., 4) -> (..., 3) radians, at most a half turn."""
+    quaternion = np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+    sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quaternion[..., 3:])
+    return quaternion[..., :3] * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0)
+
+
+def _box(codec: PoseCodec) -> tuple[np.ndarray, np.ndarray]:
+    low, high = np.array(codec.low), np.array(codec.high)
+    return (low + high) / 2, (high - low) / 2

@@ -1,0 +1,417 @@
+"""Mixtures: order, resume, targets, statistics, damage, and the calibrated dataset's way into 3D. Known motions."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_pipelines.oxe.fixtures import known_episodes, write_fixture
+from data_pipelines.oxe.fixtures_converted import DEPTH_COUNTS, camera_from_world
+from data_pipelines.oxe.index import load_index, scan
+from data_pipelines.oxe.loader import OxeLoader
+from data_pipelines.oxe.mixture import MixtureSource
+from data_pipelines.oxe.motion import Motion
+from data_pipelines.oxe.order import BlockOrder, deal, schedule
+from data_pipelines.oxe.registry import get_dataset
+from data_pipelines.oxe.targets import key_frames, make_targets
+from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
+from data_pipelines.records import DataError
+from data_pipelines.rlds.build import RldsBuild
+from data_pipelines.rlds.tfrecord import write_records
+from data_pipelines.samples import suite_tokenizer
+from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.encoding.displacement import DisplacementScale, displace
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.errors import UserError
+
+FIVE = ("nyu_rot_dataset_converted_externally_to_rlds=3", "austin_sirius_dataset_converted_externally_to_rlds",
+        "cmu_play_fusion=0.5", "utokyo_pr2_opening_fridge_converted_externally_to_rlds=2",
+        "cmu_stretch=1.5")  # fmt: skip
+MANISKILL = "maniskill_dataset_converted_externally_to_rlds"
+ENCODING = EncodingConfig(image_size=32, patch_size=16, style="compact", max_text_length=64, use_points=False)
+
+
+def names_of(mixture):
+    return [entry.partition("=")[0] for entry in mixture]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("oxe")
+    for name in (
+        *names_of(FIVE),
+        MANISKILL,
+        "roboturk",
+        "berkeley_cable_routing",
+        "utokyo_xarm_bimanual_converted_externally_to_rlds",
+    ):
+        write_fixture(folder, name, episodes=9, steps=9)
+    return folder
+
+
+def config_for(folder, mixture=FIVE, **options):
+    return OxeConfig(
+        **{"folder": str(folder), "mixture": mixture, "image_size": 32, "streams": 3, "window": 6, **options}
+    )
+
+
+def make(folder, mixture=FIVE, *, batch_size=4, encoding=ENCODING, seed=0, split=(0, 1), threads=2, **options):
+    return OxeLoader(
+        config_for(folder, mixture, **options),
+        encoding,
+        suite_tokenizer(),
+        batch_size=batch_size,
+        seed=seed,
+        process_index=split[0],
+        process_count=split[1],
+        num_threads=threads,
+        progress=False,
+    )
+
+
+def test_an_epoch_of_a_stream_is_every_sample_once():
+    samples = np.array([3, 1, 7, 2, 5, 4])
+    order = BlockOrder(samples, 2, [0])
+    total = int(samples.sum())
+    epochs = [[order.locate(epoch * total + i)[1:] for i in range(total)] for epoch in range(3)]
+    everything = [(episode, place) for episode, count in enumerate(samples) for place in range(count)]
+    assert all(sorted(epoch) == everything for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2]
+    # Never are more than two episodes open, and another order object finds any number by itself.
+    for start in range(total - 1):
+        blocks = {order.locate(i)[0] for i in (start, start + 1)}
+        assert len(blocks) <= 2
+    assert [BlockOrder(samples, 2, [0]).locate(i)[1:] for i in (40, 3, 17)] == [
+        order.locate(i)[1:] for i in (40, 3, 17)
+    ]
+
+
+def test_episodes_are_dealt_out_once():
+    dealt = deal(23, 4, [1])
+    assert sorted(np.concatenate(dealt).tolist()) == list(range(23))
+
+
+@pytest.mark.parametrize("shares", [[1.0], [0.5, 0.5], [0.001, 0.3, 0.699], [0.05] * 20])
+def test_turns_follow_the_shares_everywhere(shares):
+    shares = np.array(shares)
+    dataset, occurrence = schedule(shares, [0])
+    for number, share in enumerate(shares):
+        turns = dataset == number
+        assert turns.mean() == pytest.approx(share, rel=0.01)
+        np.testing.assert_array_equal(occurrence[turns], np.arange(turns.sum()))
+        passed = np.cumsum(turns) - np.arange(1, len(turns) + 1) * share
+        assert np.abs(passed).max() <= 2
+
+
+def test_an_epoch_of_one_dataset_is_every_frame_once(folder):
+    name = names_of(FIVE)[0]
+    source = MixtureSource(config_for(folder, (name,), streams=1), seed=3, progress=False)
+    expected = sum(episode.num_steps - 1 for episode in known_episodes(name, 9, 9))
+    assert source.num_samples == expected
+    epochs = [[source[epoch * expected + i].where for i in range(expected)] for epoch in range(2)]
+    assert len(set(epochs[0])) == len(set(epochs[1])) == expected
+    assert epochs[0] != epochs[1]
+
+
+def test_processes_share_out_the_one_stream(folder):
+    source = MixtureSource(config_for(folder), seed=3, progress=False)
+    whole = [source[i].where for i in range(90)]
+    fresh = MixtureSource(config_for(folder), seed=3, progress=False)
+    assert [[fresh[i].where for i in range(p, 90, 3)] for p in range(3)] == [whole[p::3] for p in range(3)]
+    records = [{where.partition(", step")[0] for where in whole[p::3]} for p in range(3)]
+    assert not (records[0] & records[1]) | (records[1] & records[2]) | (records[0] & records[2])
+
+
+def test_proportions_are_the_weights_times_the_sizes(folder):
+    source = MixtureSource(config_for(folder), seed=0, progress=False)
+    count = 4000
+    drawn = [source[i].dataset for i in range(count)]
+    weights = dict(zip(names_of(FIVE), (3, 1, 0.5, 2, 1.5), strict=True))
+    sizes = {name: sum(episode.num_steps - 1 for episode in known_episodes(name, 9, 9)) for name in weights}
+    total = sum(weights[name] * sizes[name] for name in weights)
+    for name in weights:
+        assert drawn.count(name) / count == pytest.approx(weights[name] * sizes[name] / total, rel=0.01)
+
+
+@pytest.mark.parametrize("processes", [1, 3])
+def test_a_stopped_run_goes_on_with_the_same_thousand_samples(folder, processes):
+    for process in range(processes):
+        split, batches = (process, processes), -(-1000 // (20 * processes))
+        loader = make(folder, batch_size=20, split=split)
+        for _ in range(7 + process):
+            next(loader)
+        state = json.loads(json.dumps(loader.get_state()))
+        resumed = make(folder, batch_size=20, split=split, threads=0)
+        resumed.set_state(state)
+        for _ in range(batches):
+            expected, got = next(loader), next(resumed)
+            assert expected.keys() == got.keys()
+            for name in expected:
+                np.testing.assert_array_equal(got[name], expected[name])
+
+
+def test_a_position_of_other_data_is_refused(folder):
+    state = make(folder).get_state()
+    with pytest.raises(DataError, match=r"saved position: data: expected .*; put the same data back"):
+        make(folder, FIVE[:4]).set_state(state)
+    assert set(state["scale"]) == {"low", "high"}
+
+
+def scale_of(loader):
+    assert loader.scale is not None
+    return loader.scale
+
+
+def truth_of(name, where):
+    """The known arms and step of a sample, by the place that it names."""
+    record, _, step = where.partition(", step ")
+    shard = int(record.rpartition("-of-")[0][-5:])
+    number = int(record.rpartition(" ")[2]) + (0 if shard == 0 else 5)
+    known = known_episodes(name, 9, 9)[number]
+    return known, int(step.partition(",")[0])
+
+
+def answer_of(batch, row, arms):
+    tokens = batch["text_tokens"][row][batch["answer_mask"][row]][:-1]
+    return parse_answer(suite_tokenizer().decode([int(token) for token in tokens]), arms, "compact")
+
+
+@pytest.mark.parametrize("name", ["nyu_rot_dataset_converted_externally_to_rlds", "berkeley_cable_routing",
+                                  "utokyo_xarm_bimanual_converted_externally_to_rlds"])  # fmt: skip
+def test_relative_answers_lead_to_where_the_hand_went(folder, name):
+    loader = make(folder, (name,), streams=1, horizon=0.4, threads=0, batch_size=16)
+    places = [loader.source[i] for i in range(16)]
+    batch = next(loader)
+    codec, ahead = PoseCodec(), max(1, round(0.4 * get_dataset(name).hz))
+    scale = scale_of(loader)
+    bin_size = (np.array(scale.high) - scale.low) / 200
+    for row, place in enumerate(places):
+        known, step = truth_of(name, place.where)
+        end = min(step + ahead, known.num_steps - 1)
+        answer = codec.decode(answer_of(batch, row, len(known.arms)))
+        moved = scale.from_pose(answer.pose, codec)
+        for i, arm in enumerate(known.arms):
+            shift = arm.position[end] - arm.position[step]
+            turn = (arm.rotation[end] * arm.rotation[step].inv()).as_rotvec()
+            truth = np.clip(np.concatenate([shift, turn]), scale.low, scale.high)
+            assert np.all(np.abs(moved[i, :3] - truth[:3]) <= 0.51 * bin_size[:3] + 1e-6)
+            # Four rounded components of a quaternion tell an axis to about two bins of its range.
+            assert np.all(np.abs(moved[i, 3:] - truth[3:]) <= 2.5 * bin_size[3:] + 1e-6)
+            gripper = 0 if name == "berkeley_cable_routing" else arm.open[min(end, known.num_steps - 2)]
+            assert answer.gripper_open[i] == gripper
+
+
+def test_absolute_answers_are_poses_and_prompts_have_no_keypoint(folder):
+    name = names_of(FIVE)[0]
+    loader = make(folder, (name,), streams=1, target="absolute", horizon=0.0, threads=0, batch_size=16)
+    places = [loader.source[i] for i in range(16)]
+    batch = next(loader)
+    assert loader.scale is None
+    codec = PoseCodec()
+    for row, place in enumerate(places):
+        known, step = truth_of(name, place.where)
+        (arm,) = known.arms
+        changes = np.flatnonzero(np.diff(arm.open)) + 1
+        answer = codec.decode(answer_of(batch, row, 1))
+        end = min([*changes[changes > step], known.num_steps - 1])
+        np.testing.assert_allclose(answer.pose[0, :3], arm.position[end], atol=0.00501)
+        assert (Rotation.from_quat(answer.pose[0, 3:]) * arm.rotation[end].inv()).magnitude() < 0.03
+        prompt = batch["text_mask"][row] & ~batch["answer_mask"][row]
+        text = suite_tokenizer().decode([int(token) for token in batch["text_tokens"][row][prompt]][1:])
+        assert text.startswith(known.instruction)
+        assert "near" not in text
+        state = np.rint(np.append(arm.position[step] * 100, 0)[:3]).astype(int)
+        assert " ".join(map(str, state)) in text
+
+
+def test_key_frames_are_gripper_changes_rests_and_the_end():
+    positions = np.cumsum([0, 1, 1, 0, 0, 0, 1, 1, 1, 1, 1, 1], dtype=float) * 0.05
+    pose = np.zeros((12, 1, 7), np.float32)
+    pose[:, 0, 0], pose[:, 0, 6] = positions, 1
+    command = np.ones((12, 1), np.float32)
+    command[8:] = 0
+    motion = Motion("", pose, command, None, command)
+    # The hand rests from step 2 on, the gripper closes at step 8, the last step is 11.
+    assert key_frames(motion) == [2, 8, 11]
+    targets = make_targets(motion, get_dataset("cmu_stretch"), OxeConfig(target="absolute", horizon=0.0))
+    assert targets.target_pose is not None
+    np.testing.assert_allclose(targets.target_pose[:, 0, 0], positions[[2, 2, 8, 8, 8, 8, 8, 8, 11, 11, 11]])
+
+
+def test_commands_compose_where_no_pose_is_told(folder):
+    # The tool turns by a quarter about z between two steps forward, in its own frame.
+    action = np.zeros((4, 1, 6), np.float32)
+    action[:2, 0, 0], action[0, 0, 5] = 0.1, np.pi / 2
+    command = np.ones((4, 1), np.float32)
+    motion = Motion("", None, command, action, command)
+    config = OxeConfig(horizon=0.2)
+    tool = make_targets(motion, get_dataset("imperialcollege_sawyer_wrist_cam"), config)
+    assert tool.displacement is not None
+    np.testing.assert_allclose(tool.displacement[0, 0], [0.1, 0.1, 0, 0, 0, np.pi / 2], atol=1e-6)
+    base = make_targets(motion, dataclasses.replace(get_dataset("cmu_play_fusion"), hz=10), config)
+    assert base.displacement is not None
+    np.testing.assert_allclose(base.displacement[0, 0], [0.2, 0, 0, 0, 0, np.pi / 2], atol=1e-6)
+
+
+def test_displacements_survive_the_box_and_lead_there():
+    rng = np.random.default_rng(0)
+    scale = DisplacementScale((-0.1, -0.2, -0.05, -0.5, -1, -0.2), (0.1, 0.1, 0.05, 0.5, 1.5, -0.2))
+    moved = rng.uniform(scale.low, scale.high, (200, 6))
+    codec = PoseCodec()
+    pose = scale.to_pose(moved, codec)
+    assert np.all(pose[:, :3] >= codec.low) and np.all(pose[:, :3] <= codec.high)  # noqa: PT018
+    np.testing.assert_allclose(scale.from_pose(pose, codec), moved, atol=1e-5)
+    start = np.concatenate([rng.normal(size=(200, 3)), Rotation.random(200, rng=rng).as_quat()], axis=1)
+    end = displace(start, moved)
+    np.testing.assert_allclose(end[:, :3] - start[:, :3], moved[:, :3], atol=1e-6)
+    turned = Rotation.from_quat(end[:, 3:]) * Rotation.from_quat(start[:, 3:]).inv()
+    np.testing.assert_allclose((turned * Rotation.from_rotvec(moved[:, 3:]).inv()).magnitude(), 0, atol=1e-6)
+    # A component without a range says nothing and is read as its value.
+    assert np.all(scale.from_pose(pose, codec)[:, 5] == np.float32(-0.2))
+
+
+def test_the_scale_is_that_of_the_known_motion(folder):
+    name = names_of(FIVE)[0]
+    loader = make(folder, (name,), horizon=0.0001, streams=1)
+    moved = []
+    for known in known_episodes(name, 9, 9):
+        (arm,) = known.arms
+        turns = (arm.rotation[1:] * arm.rotation[:-1].inv()).as_rotvec()
+        moved.append(np.concatenate([np.diff(arm.position, axis=0), turns], axis=1))
+    low, high = np.quantile(np.concatenate(moved), [0.01, 0.99], axis=0)
+    np.testing.assert_allclose(scale_of(loader).low, low, atol=3e-4)
+    np.testing.assert_allclose(scale_of(loader).high, high, atol=3e-4)
+
+
+def test_unscaled_data_are_stretched_to_the_metric_range(folder):
+    loader = make(folder, ("roboturk", names_of(FIVE)[0]), streams=1)
+    alone = make(folder, (names_of(FIVE)[0],), streams=1)
+    np.testing.assert_allclose(scale_of(loader).low, scale_of(alone).low, rtol=1e-9)
+    assert make(folder, ("roboturk",), streams=1).scale == DisplacementScale((-1.0,) * 6, (1.0,) * 6)
+
+
+def test_calibrated_depth_feeds_the_3d_path(folder):
+    encoding = dataclasses.replace(ENCODING, use_points=True)
+    loader = make(folder, (MANISKILL,), encoding=encoding, image_size=64, crop=0.6, streams=1, threads=0)
+    batch = next(loader)
+    assert batch["depth"].shape == (4, 64, 64)
+    np.testing.assert_allclose(batch["depth"], DEPTH_COUNTS / 1024)
+    world_from_camera = np.linalg.inv(camera_from_world())
+    for intrinsics, pose in zip(batch["intrinsics"], batch["world_from_camera"], strict=True):
+        np.testing.assert_allclose(pose, world_from_camera, atol=1e-6)
+        # The camera looks straight down from 1.5 m onto z = 0, so each pixel's point has z = 0, and a crop that moves
+        # by one pixel moves the point by a pixel's size.
+        pixel = np.linalg.inv(intrinsics) @ [10, 20, 1]
+        point = pose @ np.append(1.5 * pixel, 1)
+        assert abs(point[2]) < 1e-5
+    with pytest.raises(UserError, match=r"encoding.use_points: cmu_stretch have no calibrated depth"):
+        make(folder, (MANISKILL, "cmu_stretch"), encoding=encoding)
+
+
+def test_a_crop_takes_the_camera_along():
+    rng = np.random.default_rng(0)
+    intrinsics = np.array([[200, 0, 63.5], [0, 180, 47.5], [0, 0, 1]], np.float32)
+    # Where a world point falls in the picture, and where the same content is after cropping.
+    rows, columns = np.meshgrid(np.arange(96), np.arange(128), indexing="ij")
+    for _ in range(20):
+        box = random_box(rng, 96, 128, 0.5)
+        moved = crop_intrinsics(intrinsics, box, 64)
+        shown_rows, shown_columns = (crop_resize(x.astype(np.float32), box, 64) for x in (rows, columns))
+        u, v = rng.integers(8, 56, 2)
+        ray = np.linalg.inv(moved.astype(np.float64)) @ [u, v, 1]
+        before = intrinsics @ ray
+        assert before[0] == pytest.approx(shown_columns[v, u], abs=0.1)
+        assert before[1] == pytest.approx(shown_rows[v, u], abs=0.1)
+
+
+def test_light_varies_colours_and_nothing_else():
+    picture = np.random.default_rng(0).integers(0, 256, (8, 8, 3), np.uint8)
+    same = vary_light(picture, np.random.default_rng(1), 0.0)
+    np.testing.assert_allclose(same.astype(int), picture, atol=1)
+    varied = vary_light(picture, np.random.default_rng(1), 0.3)
+    assert varied.shape == picture.shape
+    assert np.abs(varied.astype(int) - picture).mean() > 2
+    np.testing.assert_array_equal(varied, vary_light(picture, np.random.default_rng(1), 0.3))
+
+
+def damaged(tmp_path, name="cmu_stretch"):
+    write_fixture(tmp_path, name, episodes=6, steps=6)
+    first, second = sorted((tmp_path / name / "0.1.0").glob("*.tfrecord-*"))
+    return first, second
+
+
+def test_damage_stops_or_is_listed(tmp_path):
+    first, second = damaged(tmp_path)
+    data = bytearray(first.read_bytes())
+    data[500] ^= 255
+    first.write_bytes(data)
+    second.write_bytes(second.read_bytes()[:-9])
+    config = config_for(tmp_path, ("cmu_stretch",), streams=1)
+    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
+    with pytest.raises(DataError, match="00000-of-00002, record 0: CRC of the record"):
+        load_index(build, dataset, config, progress=False)
+    index = load_index(build, dataset, dataclasses.replace(config, skip_bad=True), progress=False)
+    assert len(index.samples) == 4
+    assert [where.rpartition("-")[2] for where, _ in index.left_out] == ["00002, record 0", "00002"]
+    assert index.left_out[1][1].startswith("records: expected 3 and no bytes after them, got 2 whole ones")
+
+
+def test_pictures_that_cannot_be_decoded_stop_or_are_left_out(tmp_path, capsys):
+    first, _ = damaged(tmp_path)
+    records = RldsBuild(tmp_path / "cmu_stretch")
+    shard = records.open_shard(records.shards("train")[0])
+    contents = [shard.read(i) for i in range(len(shard))]
+    place = contents[1].index(b"\xff\xd8\xff")
+    contents[1] = contents[1][:place] + bytes(20) + contents[1][place + 20 :]
+    write_records(first, contents)
+    count = sum(episode.num_steps - 1 for episode in known_episodes("cmu_stretch", 6, 6))
+    with pytest.raises(DataError, match=r"record 1, step \d, steps/observation/image: image: expected a JPEG or PNG"):
+        for _ in zip(range(count), make(tmp_path, ("cmu_stretch",), streams=1, batch_size=1, threads=0), strict=False):
+            pass
+    loader = make(tmp_path, ("cmu_stretch",), streams=1, batch_size=1, threads=0, skip_bad=True)
+    for _ in range(2 * (count - 1)):
+        next(loader)
+    assert len(loader.left_out) == 1
+    assert capsys.readouterr().err.count("left out (1): ") == 1
+
+
+def test_statistics_are_kept_until_the_data_change(tmp_path, monkeypatch):
+    write_fixture(tmp_path, "cmu_stretch", episodes=4, steps=6)
+    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
+    config = config_for(tmp_path, ("cmu_stretch",))
+    first = load_index(build, dataset, config, progress=False)
+    kept = next((tmp_path / "cmu_stretch" / "0.1.0").glob("dsvla_index_*.json"))
+    with monkeypatch.context() as patch:
+        patch.setattr("data_pipelines.oxe.index.scan", lambda *_: pytest.fail("scanned again"))
+        again = load_index(build, dataset, config, progress=False)
+    np.testing.assert_array_equal(again.quantiles, first.quantiles)
+    np.testing.assert_array_equal(again.record, first.record)
+    other = load_index(build, dataset, dataclasses.replace(config, horizon=0.1), progress=False)
+    assert first.quantiles is not None
+    assert other.quantiles is not None
+    assert not np.array_equal(other.quantiles, first.quantiles)
+    assert kept.exists()
+    elsewhere = dataclasses.replace(config, cache=str(tmp_path / "cache"))
+    load_index(build, dataset, elsewhere, progress=False)
+    assert list((tmp_path / "cache").glob("*.json"))
+
+
+def test_no_picture_is_decoded_for_statistics(tmp_path, monkeypatch):
+    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6)
+    monkeypatch.setattr("cv2.imdecode", lambda *_: pytest.fail("decoded"))
+    scan(RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch"), config_for(tmp_path), progress=False)
+
+
+def test_datasets_that_cannot_give_the_targets(folder):
+    with pytest.raises(UserError, match=r"roboturk: it tells no poses of the hand.*Set target to relative"):
+        make(folder, ("roboturk", "cmu_stretch"), target="absolute")
+    loader = make(folder, ("roboturk", "cmu_stretch"), target="absolute", unsupported="leave_out")
+    assert [item.dataset.name for item in loader.source.datasets] == ["cmu_stretch"]
+    with pytest.raises(UserError, match="toto: no such dataset; copy it there from gs://gresearch/robotics/toto"):
+        make(folder, ("toto",))
+    with pytest.raises(UserError, match="9 usable episodes cannot be dealt to 16 streams; lower `streams`"):
+        make(folder, ("cmu_stretch",), streams=16)

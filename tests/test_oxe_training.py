@@ -1,0 +1,85 @@
+"""Pretraining on Open X-Embodiment and finetuning in simulation, as docs/data_oxe.md tells it, on fixtures."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from configs import get_config
+from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.encoding.displacement import displace
+from dsvla_jax.policy import Policy, load, load_policy_config
+from dsvla_jax.types import Camera, Observation
+
+ROOT = Path(__file__).parent.parent
+DATASETS = ["nyu_rot_dataset_converted_externally_to_rlds", "utokyo_xarm_bimanual_converted_externally_to_rlds"]
+
+
+def run(folder: Path, *arguments: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    result = subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=1200
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout
+
+
+def test_the_two_configs_share_one_base():
+    pretraining, finetuning = get_config("tiny_oxe"), get_config("tiny_oxe_sim")
+    assert finetuning.base == "runs/tiny_oxe"
+    assert pretraining.oxe is not None
+    assert finetuning.oxe is None
+    assert pretraining.model.vision == finetuning.model.vision
+    assert pretraining.model.language == finetuning.model.language
+    assert not pretraining.encoding.use_points
+    assert not pretraining.encoding.use_keypoints
+
+
+@pytest.mark.slow
+def test_the_documented_sequence(tmp_path: Path):
+    small = ["--batch-size", "4", "--log-every", "1"]
+    run(tmp_path, "-m", "data_pipelines.oxe", "fixtures", "data/oxe_fixtures", "--datasets", *DATASETS)
+    pretrain = [str(ROOT / "train.py"), "tiny_oxe", "--oxe.mixture", *DATASETS, "--oxe.target", "relative", *small]
+    run(tmp_path, *pretrain, "--steps", "2", "--checkpoint-every", "2")
+    # A whole run in one go, and one that is interrupted, see the same samples.
+    run(tmp_path, *pretrain, "--steps", "4", "--checkpoint-every", "2", "--run", "runs/whole")
+    config = tmp_path / "runs" / "tiny_oxe" / "config.json"
+    config.write_text((tmp_path / "runs" / "whole" / "config.json").read_text())
+    run(tmp_path, *pretrain, "--steps", "4", "--checkpoint-every", "2", "--resume")
+    losses = [
+        {line["step"]: line["loss"] for line in map(json.loads, (tmp_path / "runs" / name / "metrics.jsonl").open())}
+        for name in ("tiny_oxe", "whole")
+    ]
+    assert losses[0][3] == pytest.approx(losses[1][3], rel=1e-5)
+
+    # The scale is in the policy and in every checkpoint, and the policy needs no dataset's name to use it.
+    policy = load(tmp_path / "runs" / "tiny_oxe")
+    scale = load_policy_config(tmp_path / "runs" / "tiny_oxe").displacement
+    assert scale is not None
+    checkpoints = RunCheckpoints(tmp_path / "runs" / "tiny_oxe")
+    saved = json.loads(json.dumps(checkpoints._manager.restore(4)["iterator"]))["scale"]
+    assert saved == {"low": list(scale.low), "high": list(scale.high)}
+    checkpoints.close()
+    pose = np.array([[[0.3, -0.1, 1.1, 0, 1, 0, 0]]], np.float32)
+    observation = Observation(
+        rgb=np.zeros((1, 96, 96, 3), np.uint8),
+        depth=np.zeros((1, 1, 1), np.float32),
+        camera=Camera(np.eye(3, dtype=np.float32)[None], np.eye(4, dtype=np.float32)[None]),
+        pose=pose,
+        gripper_open=np.ones((1, 1), np.float32),
+    )
+    bare = Policy(dataclasses.replace(policy.config, displacement=None), policy.variables, policy.tokenizer)
+    told, answered = (one.act(observation, ["lift the ball"], None).action for one in (policy, bare))
+    np.testing.assert_allclose(told.pose, displace(pose, scale.from_pose(answered.pose, policy.codec)), atol=1e-6)
+    assert np.all(np.abs(np.asarray(told.pose)[..., :3] - pose[..., :3]) < 0.5)
+
+    finetune = [str(ROOT / "train.py"), "tiny_oxe_sim", "--data.tasks", "lamp_on", "--data.episodes", "4", *small]
+    run(tmp_path, *finetune, "--steps", "2")
+    assert "lamp_on" in run(
+        tmp_path, str(ROOT / "eval.py"), "runs/tiny_oxe_sim", "--tasks", "lamp_on", "--episodes", "2"
+    )
