@@ -6,12 +6,13 @@ found in and the fix: units, orders, sizes, cameras that look the other way, rot
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipelines.records import MAX_DEPTH, DataError, Episode, make_episode
+from data_pipelines.records import MAX_DEPTH, DataError, Episode, Frame, make_episode
 from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.types import Camera
@@ -21,6 +22,8 @@ ROTATION_TOLERANCE = 1e-3
 QUATERNION_TOLERANCE = 1e-2
 # Metres: no arm or camera of a table-top scene is farther from the origin, so larger numbers are other units.
 MAX_COORDINATE = 20.0
+# Metres: how far from everything seen in their directions all keypoints of objects may be.
+SURFACE_TOLERANCE = 0.1
 # Metres: a depth map whose middle value is above this is in other units.
 MAX_MIDDLE_DEPTH = 20.0
 
@@ -31,11 +34,12 @@ class Recording:
 
     task: the name under which demonstrations of one kind are kept together.
     instruction: what was to be done, in words.
-    rgb: T pictures uint8 (H, W, 3), red first. depth: T maps float (H, W), planar, 0 where there is no reading. Both
+    rgb: T pictures uint8 (H, W, 3). depth: T maps float (H, W), planar, 0 where there is no reading. Both
         may be any sequence, also one that reads files when asked: only frames that become samples are looked at.
     intrinsics: (3, 3), or (T, 3, 3) of a camera that changes, for pictures of exactly this size.
     world_from_camera: (4, 4), or (T, 4, 4) of a camera that moves: camera-to-world, z forward.
     pose: (T, A, 7), the end-effectors. gripper_open: (T, A), 0 or 1. Of two arms the left one first.
+    channels: the order of colours in `rgb`; what OpenCV reads is "bgr".
     keypoints: (A, K, 3), the points that each arm is to go near, in the order of the instruction; an arm with fewer
         than K repeats its last. None where they are not known.
     """
@@ -49,6 +53,7 @@ class Recording:
     pose: np.ndarray
     gripper_open: np.ndarray
     keypoints: np.ndarray | None = None
+    channels: Literal["rgb", "bgr"] = "rgb"
 
 
 def make_demonstration(
@@ -57,7 +62,7 @@ def make_demonstration(
     """The episode of a recording.
 
     Args:
-        samples: (observation to look at, observation to go to) each, ascending; see ``rlbench.keyframes``.
+        samples: (observation to look at, observation to go to) each, ascending; see ``keyframes.sample_starts``.
         seed: the demonstration's number, kept in the episode.
         where: names the recording in errors.
 
@@ -80,14 +85,14 @@ def make_demonstration(
         check_pictures(picture, distances, place)
         check_camera(intrinsics[start], cameras[start], picture.shape[:2], place)
     keypoints, active = _active_keypoints(recording)
-    check_keypoints(keypoints, intrinsics[starts[0]], cameras[starts[0]], where)
+    check_keypoints(keypoints, intrinsics[starts[0]], cameras[starts[0]], rgb[0].shape[:2], where)
     pose = np.array(recording.pose, np.float64)
     pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
     return make_episode(
         task=recording.task,
         instruction=recording.instruction,
         seed=seed,
-        rgb=rgb,
+        rgb=rgb if recording.channels == "rgb" else [picture[..., ::-1] for picture in rgb],
         depth=depth,
         intrinsics=intrinsics[starts],
         world_from_camera=cameras[starts],
@@ -107,9 +112,14 @@ def check_recording(recording: Recording, where: object) -> None:
             raise DataError(where, field, "words", "nothing", "say what is demonstrated")
     if "/" in recording.task:
         raise DataError(where, "task", "a name for files", repr(recording.task), "leave out the slash")
+    if recording.channels not in ("rgb", "bgr"):
+        raise DataError(
+            where, "channels", "rgb or bgr", repr(recording.channels), "say the order of the pictures' colours"
+        )
     pose, gripper = np.asarray(recording.pose), np.asarray(recording.gripper_open)
     if pose.ndim != 3 or pose.shape[1] not in (1, 2) or pose.shape[2] != 7:
         fix = "give x y z qx qy qz qw for each of one or two arms at every observation"
+        fix += "; for one arm add its axis: pose[:, None]" if pose.ndim == 2 else ""
         raise DataError(where, "pose", "(T, A, 7) with A = 1 or 2", str(pose.shape), fix)
     count, arms = pose.shape[:2]
     if gripper.shape != (count, arms):
@@ -182,7 +192,7 @@ def check_pictures(rgb: np.ndarray, depth: np.ndarray, where: object) -> None:
         raise DataError(where, "depth", "metres", f"a median of {np.median(readings):.4g}", fix)
     if depth.min() < 0 or depth.max() > MAX_DEPTH:
         span = f"{depth.min():.4g} to {depth.max():.4g}"
-        raise DataError(where, "depth", f"0 to {MAX_DEPTH} m", span, "write 0 for what is out of the camera's range")
+        raise DataError(where, "depth", f"0 to {MAX_DEPTH:g} m", span, "write 0 for what is out of the camera's range")
 
 
 def check_camera(intrinsics: np.ndarray, world_from_camera: np.ndarray, size: tuple[int, ...], where: object) -> None:
@@ -216,20 +226,50 @@ def check_camera(intrinsics: np.ndarray, world_from_camera: np.ndarray, size: tu
 
 
 def check_keypoints(
-    keypoints: np.ndarray, intrinsics: np.ndarray, world_from_camera: np.ndarray, where: object
+    keypoints: np.ndarray,
+    intrinsics: np.ndarray,
+    world_from_camera: np.ndarray,
+    size: tuple[int, ...],
+    where: object,
 ) -> None:
-    """Raises DataError where a keypoint of (A, K, 3) is not finite or lies behind the camera."""
+    """Raises DataError where keypoints (A, K, 3) are not finite, one is behind the camera, or all are out of view.
+
+    intrinsics (3, 3), world_from_camera (4, 4), size (height, width): of the first picture.
+    """
     if not np.isfinite(keypoints).all():
         raise DataError(where, "keypoints", "finite numbers", "non-finite ones", "or None where not known")
-    _, depth = project(
-        np.asarray(keypoints, np.float32),
-        Camera(jnp.asarray(intrinsics, jnp.float32), jnp.asarray(world_from_camera, jnp.float32)),
-    )
-    if keypoints.size and np.asarray(depth).min() <= 0:
+    if not keypoints.size:
+        return
+    camera = Camera(jnp.asarray(intrinsics, jnp.float32), jnp.asarray(world_from_camera, jnp.float32))
+    pixels, depth = map(np.asarray, project(np.asarray(keypoints, np.float32), camera))
+    fix = "give metres in the world frame, and world_from_camera, not its inverse"
+    if depth.min() <= 0:
         arm, place = np.unravel_index(int(np.argmin(depth)), depth.shape)
         got = f"{keypoints[arm, place].tolist()}, {float(depth[arm, place]):.3f} m along the viewing direction"
-        fix = "give metres in the world frame, and world_from_camera, not its inverse"
         raise DataError(where, f"keypoints[{arm}, {place}]", "a point before the camera", got, fix)
+    if not np.any(np.all((pixels >= 0) & (pixels < [size[1], size[0]]), axis=-1)):
+        got = f"pixels {np.rint(pixels).astype(int).tolist()}"
+        raise DataError(where, "keypoints", f"one in the first {size[1]} x {size[0]} picture", got, fix)
+
+
+def check_surface(frame: Frame, keypoints: np.ndarray, where: object) -> None:
+    """Raises DataError unless a keypoint (A, K, 3) of objects is near what the camera sees where it projects to.
+
+    Catches a calibration, a unit or a frame that is wrong though each number looks right. Passes where no keypoint is
+    on a pixel with a reading, and where any is within `SURFACE_TOLERANCE`: others may be hidden or in the air.
+    """
+    camera = Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
+    pixels, distance = map(np.asarray, project(np.asarray(keypoints, np.float32).reshape(-1, 3), camera))
+    errors = []
+    for (u, v), expected in zip(np.rint(pixels).astype(int), distance, strict=True):
+        # A keypoint is a little inside its object, and seen edges are ragged: the nearest reading around it counts.
+        window = frame["depth"][max(v - 2, 0) : max(v + 3, 0), max(u - 2, 0) : max(u + 3, 0)]
+        if (window > 0).any():
+            errors.append(np.abs(window[window > 0] - expected).min())
+    if errors and min(errors) > SURFACE_TOLERANCE:
+        got = f"{min(errors):.2f} m between the nearest of them and what is seen in its direction"
+        fix = "check world_from_camera (or is it the inverse?), intrinsics, and the frame of the keypoints"
+        raise DataError(where, "keypoints", "points on things that the camera sees", got, fix)
 
 
 def _per_observation(matrix: np.ndarray, count: int) -> np.ndarray:

@@ -4,10 +4,14 @@ import re
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from data_pipelines.episodes import EpisodeReader
+from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.types import Camera
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -20,6 +24,20 @@ def test_the_example_of_a_new_task_works():
     start = environment.reset(jax.random.split(jax.random.key(0), 2))
     assert not np.asarray(environment.success(start)).any()
     assert np.asarray(environment.success(environment.follow(start, environment.expert(start))[-1])).all()
+
+
+def test_the_example_of_own_demonstrations_works(tmp_path, monkeypatch, capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / "data_own.md").read_text(), re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "data_own.md", "exec"), {})
+    assert capsys.readouterr().out.splitlines() == ["6 samples: pick up the block"] * 3
+    frame = EpisodeReader("data/mine").frame(0)
+    # The keypoint is in the block: what is seen where it projects to is red and nearer than the table.
+    camera = Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
+    pixel, depth = project(frame["keypoint"][0], camera)
+    u, v = np.rint(np.asarray(pixel)).astype(int)
+    np.testing.assert_array_equal(frame["rgb"][v, u], [200, 40, 40])
+    np.testing.assert_allclose(np.array([frame["depth"][v, u], float(depth)]), 0.95, atol=1e-4)
 
 
 @pytest.mark.parametrize("page", [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"], ids=lambda page: page.name)

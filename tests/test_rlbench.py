@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from data_pipelines.episodes import EpisodeReader
+from data_pipelines.keyframes import discover_keyframes, sample_starts
 from data_pipelines.records import DataError, decode_frame
 from data_pipelines.rlbench.__main__ import Settings, contact_keypoints, import_demonstrations
 from data_pipelines.rlbench.files import find_episodes, read_recording, unpack_depth
-from data_pipelines.rlbench.keyframes import discover_keyframes, sample_starts
 from data_pipelines.rlbench.unpickle import read_pickle, to_array
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.geometry.cameras import project

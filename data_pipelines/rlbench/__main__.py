@@ -13,10 +13,10 @@ import tyro
 from tqdm import tqdm
 
 from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
+from data_pipelines.keyframes import discover_keyframes, sample_starts
 from data_pipelines.recording import make_demonstration
 from data_pipelines.records import DataError, Episode
 from data_pipelines.rlbench.files import find_episodes, read_recording
-from data_pipelines.rlbench.keyframes import discover_keyframes, sample_starts
 from dsvla_jax.command_line import configure_jax, fail_with_message
 
 EPISODES_PER_SHARD = 20
