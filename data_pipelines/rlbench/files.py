@@ -186,9 +186,10 @@ class _DepthMaps(_Pictures):
         self.near, self.far = near, far
 
     def __getitem__(self, number: Any) -> np.ndarray:
-        return mark_missing(
-            unpack_depth(super().__getitem__(number), float(self.near[number]), float(self.far[number]))
-        )
+        near, far = float(self.near[number]), float(self.far[number])
+        depth = unpack_depth(super().__getitem__(number), near, far)
+        # At the far plane nothing was hit.
+        return mark_missing(np.where(depth < far, depth, 0))
 
 
 def unpack_depth(picture: np.ndarray, near: float, far: float) -> np.ndarray:
