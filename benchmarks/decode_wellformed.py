@@ -1,11 +1,11 @@
 """10,000 actions from random weights and hostile logits, each kind of vocabulary and arms: none malformed (10 minutes).
 
-Usage: python -m benchmarks.decode_wellformed [--decodes 10000]
+Usage: python -m benchmarks.decode_wellformed [--decodes 10000] [--choice greedy|expected|sample]
 """
 
 import dataclasses
 import sys
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ class Options:
 
     decodes: int = 10_000
     """Of each vocabulary and number of arms."""
+    choice: Literal["greedy", "expected", "sample"] = "greedy"
 
 
 def attack(variables: Any, grammar: AnswerGrammar, trial: int, tokenizer: Tokenizer) -> Any:
@@ -52,7 +53,7 @@ def attack(variables: Any, grammar: AnswerGrammar, trial: int, tokenizer: Tokeni
     return weights
 
 
-def malformed(kind: str, style: Style, arms: int, decodes: int) -> tuple[int, int, int]:
+def malformed(kind: str, style: Style, arms: int, options: Options) -> tuple[int, int, int]:
     """How many actions of how many were malformed, and how many different ones there were."""
     tokenizer = small_tokenizer(kind)
     language = LanguageConfig(vocab_size=tokenizer.vocab_size, width=WIDTH, layers=2, heads=4, kv_heads=2, ffn=48)
@@ -60,10 +61,10 @@ def malformed(kind: str, style: Style, arms: int, decodes: int) -> tuple[int, in
         vision=VisionConfig(image_size=16, patch_size=8, width=WIDTH, layers=1, heads=4), language=language
     )
     grammar = build_answer_grammar(tokenizer, arms, style)
-    decoders = [make_decoder(VLA(config), grammar, Decoding(choice)) for choice in ("greedy", "expected", "sample")]
+    decode = make_decoder(VLA(config), grammar, Decoding(options.choice))
     variables = jax.jit(lambda: initialize(config, jax.random.key(0)))()
-    failures, seen = 0, set()
-    for trial in tqdm(range(-(-decodes // BATCH)), desc=f"{kind}, {arms} arm(s)", unit=f"{BATCH} actions"):
+    batches, failures, seen = -(-options.decodes // BATCH), 0, set()
+    for trial in tqdm(range(batches), desc=f"{kind}, {arms} arm(s)", unit=f"{BATCH} actions"):
         rng = np.random.default_rng(trial)
         lengths = rng.integers(1, 10, BATCH)
         inputs = ModelInputs(
@@ -73,7 +74,6 @@ def malformed(kind: str, style: Style, arms: int, decodes: int) -> tuple[int, in
             text_tokens=jnp.asarray(rng.integers(0, tokenizer.vocab_size, (BATCH, 9)), jnp.int32),
             text_mask=jnp.arange(9)[None] < jnp.asarray(lengths)[:, None],
         )
-        decode = decoders[trial // 4 % 3]
         decoded = decode(attack(variables, grammar, trial, tokenizer), inputs, jax.random.key(trial))
         for integers in np.asarray(decoded.integers):
             try:
@@ -82,7 +82,7 @@ def malformed(kind: str, style: Style, arms: int, decodes: int) -> tuple[int, in
             except (ParseFailure, IndexError):
                 failures += 1
             seen.add(integers.tobytes())
-    return int(failures), -(-decodes // BATCH) * BATCH, len(seen)
+    return int(failures), batches * BATCH, len(seen)
 
 
 def main(options: Options) -> int:
@@ -90,7 +90,7 @@ def main(options: Options) -> int:
     total = 0
     for kind, style in CASES:
         for arms in (1, 2):
-            failures, decodes, different = malformed(kind, style, arms, options.decodes)
+            failures, decodes, different = malformed(kind, style, arms, options)
             print(
                 f"{kind}, {arms} arm(s): {failures} of {decodes} malformed; {different} different actions", flush=True
             )

@@ -1,7 +1,6 @@
 """Decoding: against the full forward pass, independence of batch-mates, well-formed answers, ways to choose."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -12,10 +11,16 @@ import pytest
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.prompts import format_answer, parse_answer
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
-from dsvla_jax.model.decode import GREEDY, Decoding, decode_actions, make_decoder
+from dsvla_jax.model.decode import Decoding, decode_actions, make_decoder
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
-from tests.decoding import check_against_the_full_forward_pass, check_padding_and_batch_mates, small_grammar
+from tests.decoding import (
+    check_against_the_full_forward_pass,
+    check_padding_and_batch_mates,
+    decoder,
+    small_grammar,
+    whole_number_grammar,
+)
 from tests.vocabularies import small_tokenizer
 
 VOCAB = 40
@@ -24,7 +29,7 @@ CONFIG = ModelConfig(
     language=LanguageConfig(vocab_size=VOCAB, width=32, layers=2, heads=4, kv_heads=2, ffn=48),
     lora=LoraConfig(rank=2, alpha=5.0),
 )
-GRAMMAR = small_grammar()
+GRAMMAR, WHOLE = small_grammar(), whole_number_grammar()
 PROMPT_LENGTHS = np.array([9, 4, 1])
 
 
@@ -52,12 +57,6 @@ def random_variables(config: ModelConfig):
 @pytest.fixture(scope="module")
 def variables():
     return random_variables(CONFIG)
-
-
-@functools.cache
-def decoder(decoding: Decoding = GREEDY):
-    """Compiled once for each way to choose."""
-    return make_decoder(VLA(CONFIG), GRAMMAR, decoding)
 
 
 def always(token_logits: dict[int, float]):
@@ -102,7 +101,7 @@ def test_padding_and_batch_mates_never_change_an_answer(variables):
 
 @pytest.mark.parametrize(
     ("kind", "arms", "style"),
-    [("words", 2, "compact"), ("sentencepiece", 1, "paper"), ("merged", 1, "paper"), ("sentencepiece", 2, "compact")],
+    [("words", 2, "compact"), ("sentencepiece", 1, "paper"), ("merged", 1, "compact")],
 )
 def test_random_weights_give_well_formed_actions(kind, arms, style):
     tokenizer = small_tokenizer(kind)
@@ -112,7 +111,7 @@ def test_random_weights_give_well_formed_actions(kind, arms, style):
     decode = make_decoder(VLA(config), grammar)
     seen = set()
     for seed in range(3):
-        lengths = np.random.default_rng(seed).integers(1, 10, 50)
+        lengths = np.random.default_rng(seed).integers(1, 10, 25)
         weights = jax.tree.map(lambda x, s=seed: x * (1.0 + 3 * s), variables)
         decoded = decode(weights, make_prompts(lengths, seed=seed))
         assert np.isfinite(decoded.log_probs).all()
@@ -123,24 +122,25 @@ def test_random_weights_give_well_formed_actions(kind, arms, style):
             text = tokenizer.decode(grammar.tokens(integers))
             np.testing.assert_array_equal(parse_answer(text, arms, style), integers)
             seen.add(format_answer(integers, style))
-    assert len(seen) > 50
+    assert len(seen) > 20
 
 
 @pytest.mark.parametrize("choice", ["greedy", "expected", "sample"])
 def test_not_even_broken_weights_give_a_malformed_action(choice: Any):
-    decode = decoder(Decoding(choice))
+    grammar = GRAMMAR if choice == "greedy" else WHOLE
+    decode = decoder(CONFIG, grammar, Decoding(choice))
     for value in (np.nan, np.inf, -np.inf, 1e30):
         broken = always(dict.fromkeys(range(VOCAB), value))
         decoded = decode(broken, make_prompts(), jax.random.key(0))
         for row in np.asarray(decoded.integers):
-            assert all(value in slot.values for value, slot in zip(row.ravel(), GRAMMAR.slots, strict=True))
+            assert all(value in slot.values for value, slot in zip(row.ravel(), grammar.slots, strict=True))
             assert row[0, 3:7].any()
 
 
 def test_a_rotation_of_zeros_never_comes_out():
     # Numbers 3, 4 and 6 are "0" and number 5 its integer 0: the next best integer of number 6 is 9.
     zero = always({10: 90.0, 21: 80.0, 4: 80.0, 6: 80.0, 7: 80.0, 19: 60.0})
-    decoded = decoder()(zero, make_prompts())
+    decoded = decoder(CONFIG, GRAMMAR)(zero, make_prompts())
     np.testing.assert_array_equal(decoded.integers[:, 0, 3:7], [[0, 0, 0, 9]] * 3)
     assert np.isfinite(decoded.log_probs).all()
 
@@ -149,7 +149,7 @@ def test_expected_is_the_mean_of_the_distribution():
     # Number 2 is -2, -1, 0, 1 or 2, with weights 4, 0, 1, 3, 3: the best is -2, the mean 1/11.
     weights = {20 + n: float(np.log(w)) for n, w in enumerate((4.0, 1e-6, 1.0, 3.0, 3.0))}
     for choice, expected in ((Decoding("greedy"), -2), (Decoding("expected"), 0)):
-        decoded = decoder(choice)(always(weights), make_prompts())
+        decoded = decoder(CONFIG, WHOLE, choice)(always(weights), make_prompts())
         assert (np.asarray(decoded.integers[:, 0, 2]) == expected).all()
     np.testing.assert_allclose(decoded.log_probs[:, 0, 2], np.log(1 / 11), atol=1e-3)
     p = np.array([4, 1, 3, 3]) / 11
@@ -157,7 +157,7 @@ def test_expected_is_the_mean_of_the_distribution():
 
 
 def test_samples_follow_the_distribution_and_the_key():
-    decode = decoder(Decoding("sample"))
+    decode = decoder(CONFIG, WHOLE, Decoding("sample"))
     model, prompts = always({20: float(np.log(6.0))}), make_prompts(np.full(400, 9))
     drawn = decode(model, prompts, jax.random.key(0))
     # Number 2: -2 with weight 6, four others with weight 1.
@@ -165,14 +165,14 @@ def test_samples_follow_the_distribution_and_the_key():
     assert abs(share - 0.6) < 4 * np.sqrt(0.6 * 0.4 / 400)
     np.testing.assert_array_equal(decode(model, prompts, jax.random.key(0)).integers, drawn.integers)
     assert (np.asarray(decode(model, prompts, jax.random.key(1)).integers) != drawn.integers).any()
-    cold = decoder(Decoding("sample", temperature=0.05))
+    cold = decoder(CONFIG, WHOLE, Decoding("sample", temperature=0.05))
     assert (np.asarray(cold(model, prompts, jax.random.key(0)).integers[:, 0, 2]) == -2).all()
 
 
 def test_the_best_of_several_samples_is_kept(variables):
     prompts, key = make_prompts(), jax.random.key(3)
-    one = decoder(Decoding("sample"))(variables, prompts, key)
-    best = decoder(Decoding("sample", samples=20))(variables, prompts, key)
+    one = decoder(CONFIG, WHOLE, Decoding("sample"))(variables, prompts, key)
+    best = decoder(CONFIG, WHOLE, Decoding("sample", samples=20))(variables, prompts, key)
     assert (best.log_probs.sum((1, 2)) > one.log_probs.sum((1, 2))).all()
     assert best.integers.shape == one.integers.shape
 
