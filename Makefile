@@ -23,7 +23,7 @@ $(VENV)/.synced: requirements.lock
 setup: $(VENV)/.synced  ## make the virtual environment
 
 train: setup  ## demonstrations, training, closed-loop evaluation and report for CONFIG (default: tiny)
-	$(PY) train.py $(CONFIG) --run $(RUN) --resume
+	$(PY) train.py $(CONFIG) --run $(RUN)
 	$(PY) eval.py $(RUN) --skip-finished
 	@echo "report: $(RUN)/eval/mujoco.html"
 

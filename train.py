@@ -1,13 +1,16 @@
-"""Train 3DS-VLA: python train.py CONFIG [--run DIR] [--resume] [--steps 500 --optimizer.learning-rate 3e-4 ...]
+"""Train 3DS-VLA: python train.py CONFIG [--run DIR] [--steps 500 --optimizer.learning-rate 3e-4 ...]
 
 CONFIG names a file of configs/. Demonstrations are generated first where they are missing. The run folder receives the
-config, the vocabulary, checkpoints, and metrics (metrics.jsonl and TensorBoard).
+config, the vocabulary, checkpoints, and metrics (metrics.jsonl and TensorBoard). A run that was stopped, or killed,
+goes on when the same command is given again; a finished one is left as it is.
 """
 
+import contextlib
 import dataclasses
-import json
+import fcntl
+import signal
 import sys
-import time
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,8 +18,6 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
-from tensorboardX import SummaryWriter
-from tqdm import tqdm
 
 import dsvla_jax.policy
 from configs import config_names, get_config
@@ -33,9 +34,12 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
+from dsvla_jax.training import loop
 from dsvla_jax.training.distributed import Watchdog, start_processes
-from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
+from dsvla_jax.training.experiment import Experiment, load_experiment, outcome_differences, save_experiment
+from dsvla_jax.training.metrics import MetricsWriter
 from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch
+from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.weights.base import is_imported, load_for_model
 
@@ -43,62 +47,78 @@ from dsvla_jax.weights.base import is_imported, load_for_model
 PADDING_ROWS = 1024
 
 
-def main(experiment: Experiment, run: Path, resume: bool, watchdog: Watchdog) -> None:
-    """Trains one experiment into the run folder, or goes on from its newest checkpoint."""
+def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "") -> int:
+    """Trains one experiment into the run folder, or goes on from its newest checkpoint. Returns the exit status."""
     tokenizer = tokenizer_of(experiment)
     if experiment.oxe is None:
         tasks = choose_tasks(experiment.data)
         experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     mesh = make_mesh(experiment.mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
-    prepare_run_folder(run, experiment, resume)
-    checkpoints = RunCheckpoints(run)
-    if checkpoints.latest_step == experiment.steps:
-        checkpoints.close()
-        print(f"{run} has been trained to step {experiment.steps}: nothing to do")
-        return
-    loader, samples = open_data(experiment, tokenizer, part)
+    require_same_experiment(run, experiment)
+    run.mkdir(parents=True, exist_ok=True)
+    with (
+        only_one_process(run),
+        contextlib.closing(RunCheckpoints(run, keep=experiment.keep_checkpoints)) as checkpoints,
+    ):
+        if checkpoints.latest_step == experiment.steps:
+            print(f"{run} has been trained to step {experiment.steps}: nothing to do")
+            return 0
+        stopped = train(experiment, run, tokenizer, checkpoints, mesh, part, watchdog, wandb)
+        step_reached = checkpoints.latest_step
+    if stopped is not None:
+        print(f"{stopped.name}: {run} is saved at step {step_reached}; the same command goes on from there")
+        return EXIT_STATUS[stopped]
+    print(f"trained: {run} (evaluate it with: python eval.py {run})")
+    return 0
 
-    model = VLA(experiment.model)
+
+def train(
+    experiment: Experiment,
+    run: Path,
+    tokenizer: Tokenizer,
+    checkpoints: RunCheckpoints,
+    mesh: jax.sharding.Mesh,
+    part: BatchPart,
+    watchdog: Watchdog,
+    wandb: str,
+) -> signal.Signals | None:
+    """Trains from the newest checkpoint, or from the beginning. Returns the signal that stopped it, if one did."""
+    batches, samples = open_data(experiment, tokenizer, part)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
     state, frozen = make_sharded(start, mesh, base_variables(experiment, mesh))
     report_size(state.trainable, frozen, samples)
 
+    save_experiment(run / "config.json", experiment)
+    displacement = batches.scale if isinstance(batches, OxeLoader) else None
+    save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model, displacement), tokenizer)
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
-        restored = checkpoints.restore(state.trainable, state.optimizer)
-        step = jax.device_put(np.int32(restored.step), state.step.sharding)
-        state = TrainState(step, restored.trainable, restored.optimizer)
-        loader.set_state(restored.iterator)
+        restored = checkpoints.restore(loop.arrays_of(state))
+        state = loop.state_of(restored)
+        batches.set_state(restored.notes["iterator"])
         print(f"resuming {run} at step {restored.step}")
     else:
-        save_experiment(run / "config.json", experiment)
-        displacement = loader.scale if isinstance(loader, OxeLoader) else None
-        save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model, displacement), tokenizer)
         checkpoints.save_base(frozen)
 
     targets = number_rows(tokenizer, experiment.encoding.style).targets(experiment.soft_target_sigma)
-    train_step = jit_train_step(make_train_step(experiment, model, optimizer, targets), state, mesh)
-    first = int(state.step)
-    with Metrics(run, first) as metrics, tqdm(total=experiment.steps, initial=first, unit="step", desc="train") as bar:
-        for step in range(first, experiment.steps):
-            watchdog.doing(f"reading data for step {step}")
-            batch = put_batch(next(loader), mesh)
-            watchdog.doing(f"computing step {step}")
-            if step == first:
-                bar.set_postfix_str("compiling the training step")
-            state, step_metrics = train_step(state, frozen, batch)
-            bar.update()
-            done = step + 1
-            if done % experiment.log_every == 0 or done == experiment.steps:
-                values = {name: float(value) for name, value in step_metrics.items()}
-                metrics.write(done, values)
-                bar.set_postfix_str(f"loss {values['loss']:.3f}, bins within one {values['bin_within_one']:.2f}")
-            if done % experiment.checkpoint_every == 0 or done == experiment.steps:
-                checkpoints.save(done, state.trainable, state.optimizer, loader.get_state())
-    checkpoints.close()
-    print(f"trained: {run} (evaluate it with: python eval.py {run})")
+    compiled = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, targets), state, mesh)
+
+    def step(state: TrainState, batch: Mapping[str, np.ndarray]) -> tuple[TrainState, dict[str, Any]]:
+        return compiled(state, frozen, put_batch(dict(batch), mesh))
+
+    with MetricsWriter(run, int(state.step), wandb, dataclasses.asdict(experiment)) as metrics:
+        return loop.train(
+            experiment,
+            run,
+            state=state,
+            step=step,
+            batches=batches,
+            checkpoints=checkpoints,
+            metrics=metrics,
+            note=watchdog.doing,
+        )
 
 
 def open_data(experiment: Experiment, tokenizer: Tokenizer, part: BatchPart) -> tuple[Any, int]:
@@ -142,51 +162,34 @@ def base_variables(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str,
     return {"params": params}
 
 
-def prepare_run_folder(run: Path, experiment: Experiment, resume: bool) -> None:
-    """Makes the run folder, or refuses one that holds other work."""
+def require_same_experiment(run: Path, experiment: Experiment) -> None:
+    """Raises CheckpointError where the run folder holds a run that would have learned something else."""
     config = run / "config.json"
-    if config.exists():
-        if not resume:
-            raise CheckpointError(f"{run} already holds a run; go on with --resume, or choose another --run")
-        stored = load_experiment(config)
-        if stored != experiment:
-            fields = [name for name in vars(experiment) if getattr(stored, name) != getattr(experiment, name)]
-            raise CheckpointError(
-                f"{config}: this run was started with another config ({', '.join(fields)} differ); "
-                "resume it with the same one, or choose another --run"
-            )
-    run.mkdir(parents=True, exist_ok=True)
+    if not config.exists():
+        return
+    if fields := outcome_differences(load_experiment(config), experiment):
+        raise CheckpointError(
+            f"{config}: this run was started with another config ({', '.join(fields)} differ); "
+            "go on with the same one, or choose another --run"
+        )
+
+
+@contextlib.contextmanager
+def only_one_process(run: Path) -> Iterator[None]:
+    """Holds the run folder against another train.py; the system lets go of it however this one ends."""
+    with (run / ".lock").open("w") as file:
+        try:
+            if jax.process_index() == 0:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UserError(f"{run}: another process is training this run; wait for it, or stop it first") from error
+        yield
 
 
 def report_size(trainable: Any, frozen: Any, samples: int) -> None:
     """Prints what will be trained."""
     learn, rest = (sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (trainable, frozen))
     print(f"{learn:,} trainable and {rest:,} frozen parameters; {samples:,} samples")
-
-
-class Metrics:
-    """Writes numbers to metrics.jsonl and to TensorBoard."""
-
-    def __init__(self, run: Path, step: int):
-        self._file = (run / "metrics.jsonl").open("a")
-        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=step)
-        self._clock = (step, time.monotonic())
-
-    def write(self, step: int, values: dict[str, float]) -> None:
-        last_step, last_time = self._clock
-        self._clock = (step, time.monotonic())
-        values = {**values, "seconds_per_step": (self._clock[1] - last_time) / max(step - last_step, 1)}
-        self._file.write(json.dumps({"step": step, **values}) + "\n")
-        self._file.flush()
-        for name, value in values.items():
-            self._board.add_scalar(name, value, step)
-
-    def __enter__(self) -> "Metrics":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-        self._board.close()
 
 
 def command_line(arguments: list[str]) -> None:
@@ -200,22 +203,22 @@ def command_line(arguments: list[str]) -> None:
     start_processes()
     configure_jax()
 
-    def train(
+    def train_run(
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = experiment,
         run: Path = Path("runs") / name,
-        resume: bool = False,
-    ) -> None:
+        wandb: str = "",
+    ) -> int:
         """Trains one experiment.
 
         Args:
             experiment: what to train; every field of the config can be overridden.
-            run: the run folder.
-            resume: go on from the newest checkpoint of the run folder; a finished run is left as it is.
+            run: the run folder; one that holds a run of the same config goes on from its newest checkpoint.
+            wandb: the project of Weights & Biases to write metrics to as well.
         """
         with Watchdog(run / "processes").watching() as watchdog:
-            main(experiment, run, resume, watchdog)
+            return main(experiment, run, watchdog, wandb)
 
-    tyro.cli(train, args=rest, prog=f"train.py {name}", config=(tyro.conf.AvoidSubcommands,))
+    sys.exit(tyro.cli(train_run, args=rest, prog=f"train.py {name}", config=(tyro.conf.AvoidSubcommands,)))
 
 
 if __name__ == "__main__":

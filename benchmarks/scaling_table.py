@@ -9,6 +9,7 @@ missing. Slices that --plans already has are not compiled again.
 """
 
 import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -88,7 +89,7 @@ def shortcomings(plans: list[dict[str, Any]]) -> list[str]:
         told += [] if plan["fits"] else [f"{plan['topology']}: does not fit"]
         told += [] if ratio <= FLOPS_RATIO else [f"{plan['topology']}: {ratio:.2f} times the FLOPs counted by hand"]
         told += [] if not plan["unknown_loops"] else [f"{plan['topology']}: loops of unknown length"]
-    for smaller, larger in zip(plans, plans[1:], strict=False):
+    for smaller, larger in itertools.pairwise(plans):
         pair = f"{smaller['topology']} to {larger['topology']}"
         told += [] if larger["peak"] <= smaller["peak"] else [f"{pair}: memory a chip grows"]
         # Buffers are padded to whole tiles, which differs with the slice by less than this.

@@ -54,10 +54,11 @@ def make_loader(
     to_sample: (frame, generator) -> arrays of shapes that are the same for all samples. The generator depends only on
     `seed` and the position in the stream, so a resumed run draws the same augmentation. Default: `frame_arrays`.
     num_epochs: None repeats for ever, and a batch may then span two epochs; otherwise a last partial batch is dropped.
-    process_index, process_count: each process gets its own samples; together they get each one once. `batch_size` is
-    of one process.
+    process_index, process_count: a batch of all processes together is cut into `process_count` equal parts, of
+    `batch_size` samples each, and this process gets its part: the whole is the same however many share it.
 
-    The iterator has ``get_state()`` and ``set_state(state)``: a JSON-able position, exact to the sample.
+    The iterator has ``get_state()`` and ``set_state(state)``: a JSON-able position, which counts batches. It is the
+    same in every process, and good for another number of processes that share batches of the same size.
     """
     if to_sample is None and len(set(reader.num_arms.values())) > 1:
         raise ValueError(
@@ -72,9 +73,10 @@ def make_loader(
     dataset = grain.MapDataset.source(FrameSource(reader)).seed(seed)
     if shuffle:
         dataset = dataset.shuffle()
-    dataset = dataset.repeat(num_epochs)
+    # The random map stands before the processes part, so that a sample is varied alike whoever reads it.
+    dataset = dataset.repeat(num_epochs).random_map(to_sample or frame_arrays)
+    batches = dataset.batch(batch_size, drop_remainder=True)
     if process_count > 1:
-        dataset = dataset[process_index::process_count]
-    dataset = dataset.random_map(to_sample or frame_arrays)
-    options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=4 * batch_size if num_threads else 0)
-    return iter(dataset.to_iter_dataset(options).batch(batch_size, drop_remainder=True))
+        batches = batches[process_index : len(batches) // process_count * process_count : process_count]
+    options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=4 if num_threads else 0)
+    return iter(batches.to_iter_dataset(options))

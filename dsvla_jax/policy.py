@@ -1,10 +1,12 @@
 """A trained policy: Observation and instruction in, Action out. Evaluation and serving both use exactly this."""
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import cattrs
 import jax
@@ -172,9 +174,15 @@ def load_policy_config(run: Path) -> PolicyConfig:
         ) from error
 
 
-def load(run: Path, mesh: jax.sharding.Mesh | None = None, decoding: Decoding = GREEDY) -> Policy:
-    """The policy of a run folder, with the weights of its newest checkpoint, split over the mesh if there is one.
+def load(
+    run: Path,
+    mesh: jax.sharding.Mesh | None = None,
+    decoding: Decoding = GREEDY,
+    step: int | Literal["best"] | None = None,
+) -> Policy:
+    """The policy of a run folder, split over the mesh if there is one.
 
+    step: the checkpoint whose weights it gets: a number, "best" by validation, or the newest if not given.
     Raises CheckpointError naming what is missing or does not fit.
     """
     config = load_policy_config(run)
@@ -182,7 +190,6 @@ def load(run: Path, mesh: jax.sharding.Mesh | None = None, decoding: Decoding = 
     like = jax.eval_shape(lambda: initialize(config.model, jax.random.key(0)))
     if mesh is not None:
         like = jax.tree.map(lambda leaf, where: leaf.update(sharding=where), like, shardings(like, mesh))
-    checkpoints = RunCheckpoints(run)
-    variables = checkpoints.restore_variables(like)
-    checkpoints.close()
+    with contextlib.closing(RunCheckpoints(run, read_only=True)) as checkpoints:
+        variables = checkpoints.restore_variables(like, step)
     return Policy(config, variables, tokenizer, decoding)

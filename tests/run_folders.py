@@ -48,6 +48,6 @@ def write_run(run: Path, model: ModelConfig, regime: str = "lora") -> dict[str, 
     save_policy_config(run, PolicyConfig(encoding, model), TOKENIZER)
     checkpoints = RunCheckpoints(run)
     checkpoints.save_base(frozen)
-    checkpoints.save(1, trainable, {"count": np.zeros(1)}, {"position": 0})
+    checkpoints.save(1, {"trainable": trainable}, {})
     checkpoints.close()
     return variables

@@ -19,7 +19,7 @@ from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.training.experiment import Experiment
-from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step, model_inputs
+from dsvla_jax.training.state import make_optimizer, make_train_step, model_inputs, start_state
 
 # row: (3D spatial constraint, 3D tokens, aligned positional embeddings)
 ROWS = {
@@ -79,7 +79,7 @@ def test_row_trains(name: str):
     values = suite_tokenizer().number_values
     trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0), values), experiment.regime)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    state = start_state(trainable, optimizer, experiment.seed)
     targets = number_rows(suite_tokenizer(), experiment.encoding.style).targets(experiment.soft_target_sigma)
     step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, targets))
     losses = []

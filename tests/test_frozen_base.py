@@ -101,7 +101,7 @@ def test_adapters_of_the_base_need_adapters_in_the_config(tmp_path):
     with pytest.raises(CheckpointError, match=r"model.lora.rank: the config says 16, the folder 2"):
         start(dataclasses.replace(small, model=model))
     state, _ = start(dataclasses.replace(small, model=dataclasses.replace(model, lora=LoraConfig(rank=2, alpha=2.0))))
-    gate = load_backbones(out)["params"]["projector"]["gate"]
+    gate = load_backbones(tmp_path / "base")["params"]["projector"]["gate"]
     assert np.abs(gate).min() > 0
     np.testing.assert_array_equal(state.trainable["params"]["projector"]["gate"], gate)
 
@@ -155,7 +155,7 @@ def test_a_model_with_eight_bit_kernels_is_the_model_with_their_values():
 
 def test_eight_bit_base_trains_from_imported_weights(imported):
     experiment = experiment_on(imported, base_dtype="int8")
-    state, frozen = start(experiment)
+    _, frozen = start(experiment)
     expected = quantize(load_backbones(imported)["params"] | {"vision": {}})["language"]
     jax.tree.map(np.testing.assert_array_equal, frozen["params"]["language"], expected)
     with pytest.raises(UserError, match=r"base_dtype: 'int8' is for frozen weights, but regime 'full'"):

@@ -15,7 +15,7 @@ from dsvla_jax.encoding.text import WordTokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests.vocabularies import small_tokenizer
 from train import tokenizer_of
 
@@ -68,8 +68,7 @@ def test_training_step_has_consistent_shapes(shapes):
     optimizer = make_optimizer(EXPERIMENT.optimizer, EXPERIMENT.steps)
     targets = number_rows(small_tokenizer("sentencepiece"), EXPERIMENT.encoding.style).targets(0.0)
     step = make_train_step(EXPERIMENT, VLA(EXPERIMENT.model), optimizer, targets)
-    start: Any = jax.ShapeDtypeStruct((), jnp.int32)
-    state = TrainState(start, trainable, jax.eval_shape(optimizer.init, trainable))
+    state = jax.eval_shape(lambda tree: start_state(tree, optimizer, EXPERIMENT.seed), trainable)
     size, text = EXPERIMENT.data.image_size, EXPERIMENT.encoding.max_text_length
     batch = {
         name: jax.ShapeDtypeStruct((EXPERIMENT.batch_size, *shape), dtype)

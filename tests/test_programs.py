@@ -4,9 +4,13 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from configs import get_config
+from dsvla_jax.training.experiment import save_experiment
 
 ROOT = Path(__file__).parent.parent
 
@@ -41,16 +45,16 @@ def test_a_mistake_ends_in_one_message(arguments: list[str], expected: str, tmp_
     assert not any(tmp_path.rglob("*.json")), "nothing is written for a mistake"
 
 
-def test_an_existing_run_is_not_overwritten(tmp_path: Path):
+def test_a_run_of_another_config_is_not_overwritten(tmp_path: Path):
     folder = tmp_path / "runs" / "tiny"
     folder.mkdir(parents=True)
-    config = folder / "config.json"
-    config.write_text("{}")
+    save_experiment(folder / "config.json", replace(get_config("tiny"), batch_size=7, log_every=3))
+    before = (folder / "config.json").read_text()
     result = run(str(ROOT / "train.py"), "tiny", folder=tmp_path)
     assert result.returncode == 1
-    assert "already holds a run" in result.stderr
+    assert "started with another config (batch_size differ)" in result.stderr
     assert "Traceback" not in result.stderr
-    assert config.read_text() == "{}"
+    assert (folder / "config.json").read_text() == before
 
 
 @pytest.mark.slow
@@ -71,7 +75,7 @@ def test_damage_ends_in_one_message_and_loses_nothing(tmp_path: Path):
         result = (
             run(str(ROOT / program), *arguments, folder=tmp_path)
             if arguments
-            else train("other", "--model.language.layers", "2", "--steps", "3", "--resume")
+            else train("other", "--model.language.layers", "2", "--steps", "3")
         )
         assert result.returncode == 1
         assert "Traceback" not in result.stderr

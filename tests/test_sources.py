@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -26,7 +25,7 @@ from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
-from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests import rlbench_files as files
 
 TASKS = ["lamp_on", "bimanual_lift_ball"]
@@ -98,7 +97,7 @@ def test_an_imported_folder_is_learned(folder):
     trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0)), "full")
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     targets = number_rows(tokenizer, "compact").targets(experiment.soft_target_sigma)
-    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    state = start_state(trainable, optimizer, experiment.seed)
     step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, targets))
     losses = []
     for _ in range(experiment.steps):

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.encoding.encode import EncodingConfig, encode_text
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.number_targets import NumberTargets, number_rows
@@ -20,7 +19,7 @@ from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.objective import answer_loss
-from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step
+from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests.vocabularies import KINDS, small_tokenizer
 
 VOCABULARY = 40
@@ -71,7 +70,7 @@ def train(experiment: Experiment, steps: int):
     variables = initialize(experiment.model, jax.random.key(0))
     trainable, frozen = split_variables(variables, experiment.regime)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    state = start_state(trainable, optimizer, experiment.seed)
     step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, NO_NUMBERS))
     losses = []
     for _ in range(steps):
@@ -175,55 +174,6 @@ def test_soft_targets_are_the_probabilities_of_nearby_bins(kind):
     assert numbers.rows(truth)[-2:].tolist() == [0, 0], "neither status, full stop nor end"
     soft, hard = (number_example(tokenizer, [[12, -7, 140, 0, 99, 0, 7, 1]], s)["loss"] for s in (sigma, 0.0))
     assert hard < 1e-3 < soft
-
-
-def test_checkpoint_resumes_training_exactly(tmp_path: Path):
-    experiment = small_experiment()
-    _, state, _, _ = train(experiment, 3)
-    checkpoints = RunCheckpoints(tmp_path)
-    checkpoints.save(3, state.trainable, state.optimizer, {"position": 7})
-    checkpoints.close()
-    checkpoints = RunCheckpoints(tmp_path)
-    restored = checkpoints.restore(state.trainable, state.optimizer)
-    checkpoints.close()
-    assert (restored.step, restored.iterator) == (3, {"position": 7})
-    for saved, loaded in zip(
-        jax.tree.leaves((state.trainable, state.optimizer)),
-        jax.tree.leaves((restored.trainable, restored.optimizer)),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(saved, loaded)
-
-
-def test_lora_checkpoint_holds_the_base_once_and_gives_all_variables(tmp_path: Path):
-    experiment = small_experiment(regime="lora")
-    variables, state, frozen, _ = train(experiment, 2)
-    checkpoints = RunCheckpoints(tmp_path)
-    checkpoints.save_base(frozen)
-    checkpoints.save(2, state.trainable, state.optimizer, {})
-    loaded = checkpoints.restore_variables(jax.eval_shape(lambda: variables))
-    checkpoints.close()
-    expected = join_variables(state.trainable, frozen)
-    assert jax.tree.structure(loaded) == jax.tree.structure(expected)
-    jax.tree.map(np.testing.assert_array_equal, loaded, expected)
-
-
-def test_a_checkpoint_of_another_size_is_refused_by_name(tmp_path: Path):
-    experiment = small_experiment()
-    _, state, _, _ = train(experiment, 1)
-    checkpoints = RunCheckpoints(tmp_path)
-    checkpoints.save(1, state.trainable, state.optimizer, {})
-    wider = dataclasses.replace(experiment.model, language=dataclasses.replace(experiment.model.language, width=64))
-    other = jax.eval_shape(lambda: initialize(wider, jax.random.key(0)))
-    with pytest.raises(CheckpointError, match=r"another model: .*expected .*found"):
-        checkpoints.restore(other)
-    checkpoints.close()
-
-
-def test_an_empty_run_says_how_to_train(tmp_path: Path):
-    checkpoints = RunCheckpoints(tmp_path)
-    with pytest.raises(CheckpointError, match="no complete checkpoint; train first"):
-        checkpoints.restore({})
 
 
 def test_experiment_survives_json(tmp_path: Path):

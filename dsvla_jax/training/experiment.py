@@ -65,6 +65,10 @@ class Experiment:
     seed: int = 0
     log_every: int = 20
     checkpoint_every: int = 250
+    keep_checkpoints: int = 2
+    """The newest checkpoints that stay."""
+    max_skipped_steps: int = 10
+    """Steps whose loss or gradient is not finite are skipped; a run with more of them stops."""
 
     def __post_init__(self) -> None:
         if self.regime == "lora" and self.model.lora is None:
@@ -76,12 +80,23 @@ class Experiment:
             )
 
 
+# What may change when a run goes on: none of it changes what the run learns.
+FREE_TO_CHANGE = ("mesh", "evaluation", "log_every", "checkpoint_every", "keep_checkpoints", "max_skipped_steps")
+
+
+def outcome_differences(one: Experiment, other: Experiment) -> list[str]:
+    """The fields that differ, of those that decide what a run learns."""
+    return [name for name in vars(one) if name not in FREE_TO_CHANGE and getattr(one, name) != getattr(other, name)]
+
+
 _converter = cattrs.Converter(forbid_extra_keys=True)
 
 
 def save_experiment(path: Path, experiment: Experiment) -> None:
-    """Writes the experiment as JSON."""
-    path.write_text(json.dumps(dataclasses.asdict(experiment), indent=2) + "\n")
+    """Writes the experiment as JSON: whole, or not at all."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(dataclasses.asdict(experiment), indent=2) + "\n")
+    partial.replace(path)
 
 
 def load_experiment(path: Path) -> Experiment:

@@ -22,11 +22,18 @@ from dsvla_jax.types import Array, Camera, ModelInputs, Observation
 
 @struct.dataclass
 class TrainState:
-    """step: int32 (). trainable: the variables that learn. optimizer: optax state over exactly those."""
+    """What a step changes, and all that the next one needs.
+
+    step: int32 (). trainable: the variables that learn. optimizer: optax state over exactly those.
+    skipped: int32 (), steps whose loss or gradient was not finite; they changed nothing.
+    rng: the key of what is random in the network, the same at every step; a step folds its number in.
+    """
 
     step: Array
     trainable: Variables
     optimizer: optax.OptState
+    skipped: Array
+    rng: Array
 
 
 TrainStep = Callable[[TrainState, Variables, dict[str, Array]], tuple[TrainState, dict[str, Array]]]
@@ -46,8 +53,14 @@ def initial_state(
     for collection, towers in (base or {}).items():
         variables[collection] = {**variables[collection], **towers}
     trainable, frozen = split_variables(variables, experiment.regime)
-    state = TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable))
+    state = start_state(trainable, optimizer, experiment.seed)
     return state, narrow_frozen(frozen, experiment.model.frozen_dtype)
+
+
+def start_state(trainable: Variables, optimizer: optax.GradientTransformation, seed: int) -> TrainState:
+    """The state at step 0 of variables that learn."""
+    zero = jnp.zeros((), jnp.int32)
+    return TrainState(zero, trainable, optimizer.init(trainable), jnp.zeros_like(zero), jax.random.key(seed))
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
@@ -90,6 +103,7 @@ def make_train_step(
     """``step(state, frozen, batch) -> (state, metrics)``, to be jitted by the caller (`jit_train_step`).
 
     Gradients are taken with respect to the trainable variables only: frozen parameters cost no weight gradient.
+    A step whose loss or gradient is not finite leaves variables and optimizer as they were, and is counted.
     targets: of the tokenizer and style that the batches were written with.
     """
 
@@ -102,7 +116,8 @@ def make_train_step(
             )
 
             def loss_of(trainable: Variables):
-                logits = model.apply(join_variables(trainable, frozen), inputs)
+                dropout = jax.random.fold_in(state.rng, state.step)
+                logits = model.apply(join_variables(trainable, frozen), inputs, rngs={"dropout": dropout})
                 assert isinstance(logits, jax.Array)
                 return answer_loss(
                     logits, inputs.text_tokens, batch["answer_mask"], batch["number_rows"], targets, counts
@@ -114,10 +129,27 @@ def make_train_step(
         gradients, metrics = _sum_over_parts(part, batch, experiment.gradient_accumulation)
         updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.trainable)
         trainable = cast(Variables, optax.apply_updates(state.trainable, updates))
-        metrics["gradient_norm"] = optax.tree.norm(gradients)
-        return TrainState(state.step + 1, trainable, optimizer_state), metrics
+        metrics |= gradient_norms(gradients)
+        finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["gradient_norm"])
+        trainable, optimizer_state = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old),
+            (trainable, optimizer_state),
+            (state.trainable, state.optimizer),
+        )
+        metrics["skipped_steps"] = state.skipped + ~finite
+        return TrainState(state.step + 1, trainable, optimizer_state, metrics["skipped_steps"], state.rng), metrics
 
     return step
+
+
+def gradient_norms(gradients: Variables) -> dict[str, Array]:
+    """The norm of the whole gradient, and that of each part of the network, the adapters being parts of their own."""
+    parts = {
+        f"gradient_norm/{name if collection == 'params' else f'{collection}/{name}'}": optax.tree.norm(part)
+        for collection, tree in gradients.items()
+        for name, part in tree.items()
+    }
+    return {"gradient_norm": jnp.sqrt(sum(norm**2 for norm in parts.values())), **parts}
 
 
 def jit_train_step(step: TrainStep, state: TrainState, mesh: Mesh) -> Any:

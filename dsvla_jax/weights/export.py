@@ -64,7 +64,7 @@ def export_run(run: Path, out: Path, model: ModelConfig, tokenizer: Tokenizer, o
     """
     if out.exists():
         raise CheckpointError(f"{out} exists already; remove it, or choose another folder")
-    checkpoints = RunCheckpoints(run)
+    checkpoints = RunCheckpoints(run, read_only=True)
     variables = checkpoints.list_variables()
     checkpoints.close()
     tree = traverse_util.unflatten_dict(variables)

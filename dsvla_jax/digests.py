@@ -1,0 +1,43 @@
+"""Whether the files of a checkpoint are those that were written: their sizes and sha256, kept beside them.
+
+Orbax restores arrays with flipped bits without a word, and the errors of a truncated file are TensorStore's.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+
+FILE = "digests.json"
+
+
+def write_digests(folder: Path) -> None:
+    """Notes size and sha256 of every file in the folder's sub-folders."""
+    # Orbax goes on writing to the files at the top; they hold nothing that is restored.
+    files = sorted(path for item in folder.iterdir() if item.is_dir() for path in item.rglob("*") if path.is_file())
+    digests = {str(path.relative_to(folder)): (path.stat().st_size, file_digest(path)) for path in files}
+    (folder / FILE).write_text(json.dumps(digests, indent=1) + "\n")
+
+
+def damage(folder: Path) -> str | None:
+    """What is wrong with the files, compared with what `write_digests` noted; None where nothing is."""
+    try:
+        digests = json.loads((folder / FILE).read_text())
+    except FileNotFoundError:
+        return f"{FILE} is missing"
+    except ValueError:
+        return f"{FILE} is not JSON"
+    for name, (size, digest) in digests.items():
+        path = folder / name
+        if not path.is_file():
+            return f"{name} is missing"
+        if path.stat().st_size != size:
+            return f"{name} has {path.stat().st_size} bytes, {size} were written"
+        if file_digest(path) != digest:
+            return f"{name} is not what was written (sha256 differs)"
+    return None
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,111 @@
+"""The training loop: steps, numbers, checkpoints, and an end that loses nothing."""
+
+import dataclasses
+import signal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from dsvla_jax.checkpoints import Restored, RunCheckpoints
+from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.health import Clock, SkippedSteps, memory
+from dsvla_jax.training.metrics import MetricsWriter
+from dsvla_jax.training.signals import StopRequest
+from dsvla_jax.training.state import TrainState
+
+Step = Callable[[TrainState, Mapping[str, np.ndarray]], tuple[TrainState, dict[str, Any]]]
+
+
+class Batches(Protocol):
+    """An endless stream of batches whose position can be saved as JSON."""
+
+    def __next__(self) -> Mapping[str, np.ndarray]: ...
+    def get_state(self) -> dict[str, Any]: ...
+
+
+def train(
+    experiment: Experiment,
+    run: Path,
+    *,
+    state: TrainState,
+    step: Step,
+    batches: Batches,
+    checkpoints: RunCheckpoints,
+    metrics: MetricsWriter,
+    note: Callable[[str], None] = lambda doing: None,
+) -> signal.Signals | None:
+    """Trains from the state's step to the experiment's last, saving on the way and at the end.
+
+    step: trains on this process's part of a batch; may consume the state that it is given.
+    note: is told what is being done, in words that name the step.
+    Returns the signal that asked to stop, None where training is finished. Either way the last step is on disk.
+    Raises UserError where a checkpoint cannot be written, or too many steps were not finite.
+    """
+    first = done = int(state.step)
+    clock = Clock()
+    skipped = SkippedSteps(run / "skipped", experiment.max_skipped_steps, int(state.skipped))
+    bar = tqdm(total=experiment.steps, initial=first, unit="step", desc="train", disable=jax.process_index() > 0)
+    stop: signal.Signals | None = None
+    with bar, StopRequest() as request:
+        bar.set_postfix_str("compiling the training step")
+        for done in range(first + 1, experiment.steps + 1):
+            note(f"reading data for step {done}")
+            with clock.waiting():
+                batch = next(batches)
+            note(f"computing step {done}")
+            state, values = step(state, batch)
+            skipped.watch(done, batch, values["skipped_steps"])
+            bar.update()
+            if not clock.started():
+                jax.block_until_ready(values)
+                clock.start()
+            else:
+                clock.count(experiment.batch_size, int(batch["text_mask"].sum()) * jax.process_count())
+            stop = request.after(done)
+            last = done == experiment.steps or stop is not None
+            if done % experiment.log_every == 0 or done == experiment.steps:
+                numbers = {name: float(value) for name, value in values.items()}
+                metrics.write(done, {**numbers, **clock.read(), **memory()})
+                bar.set_postfix_str(f"loss {numbers['loss']:.3f}, bins within one {numbers['bin_within_one']:.2f}")
+                checkpoints.raise_if_failed()
+            if done % experiment.checkpoint_every == 0 or last:
+                skipped.settle()
+                metrics.sync()
+                with clock.paused():
+                    checkpoints.save(done, arrays_of(state), notes_of(experiment, batches))
+            if stop is not None:
+                bar.set_postfix_str(f"{stop.name}: saving step {done}")
+                break
+    checkpoints.wait()
+    return stop if done < experiment.steps else None
+
+
+def arrays_of(state: TrainState) -> dict[str, Any]:
+    """The state as `RunCheckpoints` keeps it."""
+    return {
+        "trainable": state.trainable,
+        "optimizer": state.optimizer,
+        "counters": {"step": state.step, "skipped": state.skipped},
+        "rng": {"key": state.rng},
+    }
+
+
+def notes_of(experiment: Experiment, batches: Batches) -> dict[str, Any]:
+    """What a checkpoint keeps besides arrays."""
+    return {"iterator": batches.get_state(), "config": dataclasses.asdict(experiment)}
+
+
+def state_of(restored: Restored) -> TrainState:
+    """The inverse of `arrays_of`."""
+    arrays = restored.arrays
+    return TrainState(
+        step=arrays["counters"]["step"],
+        trainable=arrays["trainable"],
+        optimizer=arrays["optimizer"],
+        skipped=arrays["counters"]["skipped"],
+        rng=arrays["rng"]["key"],
+    )

@@ -1,0 +1,97 @@
+"""Where a run's numbers go: metrics.jsonl and TensorBoard always, Weights & Biases where asked for."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tensorboardX import SummaryWriter
+
+from dsvla_jax.errors import UserError
+
+FILE = "metrics.jsonl"
+
+
+class MetricsWriter:
+    """Writes one line a step. A run that goes on from a checkpoint first forgets what came after it, so that the file
+    holds each step once.
+
+    step: that of the checkpoint, or 0. wandb_project: the Weights & Biases project to write to as well, if any.
+    """
+
+    def __init__(self, run: Path, step: int, wandb_project: str = "", config: Mapping[str, Any] | None = None):
+        self._path = run / FILE
+        rewind(self._path, step)
+        self._file = self._path.open("a")
+        # TensorBoard hides what an earlier process wrote from this step on.
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=step + 1)
+        self._wandb = _start_wandb(run, wandb_project, config or {}) if wandb_project else None
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Writes the numbers of a step. One that is not finite becomes null in the file."""
+        finite = {name: value for name, value in values.items() if math.isfinite(value)}
+        line = json.dumps({"step": step, **{name: finite.get(name) for name in values}})
+        try:
+            self._file.write(line + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise UserError(
+                f"{self._path}: cannot be written ({error}); free space, or make it writable, and give the same "
+                "command again: it goes on from the newest checkpoint"
+            ) from error
+        for name, value in finite.items():
+            self._board.add_scalar(name, value, step)
+        if self._wandb is not None:
+            self._wandb.log({"step": step, **finite})
+
+    def sync(self) -> None:
+        """Makes sure that the lines survive a power failure. Called before a checkpoint that goes on behind them."""
+        os.fsync(self._file.fileno())
+
+    def __enter__(self) -> "MetricsWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        self._board.close()
+        if self._wandb is not None:
+            self._wandb.finish()
+
+
+def rewind(path: Path, step: int) -> None:
+    """Drops the lines of later steps, and a last one that was cut short. Other lines stay as they are."""
+    if not path.exists():
+        return
+    kept = [line for line in path.read_text().splitlines(keepends=True) if _step_of(line) <= step]
+    partial = path.with_suffix(".partial")
+    with partial.open("w") as file:
+        file.writelines(kept)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def _step_of(line: str) -> float:
+    try:
+        return json.loads(line)["step"] if line.endswith("\n") else math.inf
+    except ValueError:
+        return math.inf
+
+
+def _start_wandb(run: Path, project: str, config: Mapping[str, Any]) -> Any:
+    try:
+        import wandb  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise UserError("--wandb: the package is not installed; install it with: pip install wandb") from error
+    name = run / "wandb_id.txt"
+    if not name.exists():
+        name.write_text(wandb.util.generate_id())
+    session = wandb.init(
+        project=project, id=name.read_text(), resume="allow", dir=run, name=run.name, config=dict(config)
+    )
+    # W&B's own counter never goes back, a resumed run does: plots go by ours.
+    session.define_metric("step")
+    session.define_metric("*", step_metric="step")
+    return session
