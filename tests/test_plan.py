@@ -116,6 +116,7 @@ def dot_flops(jaxpr: Any) -> int:
     ("fusion", "regime", "remat"),
     [
         ("adapter", "lora", "full"),
+        ("adapter", "adapters", "full"),
         ("adapter", "full", "dots"),
         ("adapter", "lora", "none"),
         ("prefix", "lora", "dots"),

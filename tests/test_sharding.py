@@ -145,6 +145,21 @@ def test_optimizer_memory_is_that_of_what_learns(paper):
     assert moments <= whole(state.optimizer) < moments + 100
 
 
+def test_a_checkpoint_of_adapters_alone_is_small(paper):
+    state, _ = paper
+    adapters = state.trainable["lora"]
+    assert whole(adapters) == 4 * (39_976_960 + 7_077_888) == 188_219_392
+    experiment = dataclasses.replace(get_config("paper_7b"), regime="adapters")
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    alone, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+    assert set(alone.trainable) == {"lora"}
+    assert whole(alone.trainable) == whole(adapters) < 250e6
+    # With the projection, which the paper's regime trains too, it is five times that.
+    assert 1.3e9 < whole(state.trainable) == 4 * 334_283_776
+    assert whole(alone.optimizer) < 2 * whole(adapters) + 100
+    assert "projector" in frozen["params"]
+
+
 def test_the_frozen_base_is_kept_in_the_dtype_that_it_is_used_in(paper):
     _, frozen = paper
     wide = {path[-1] for path, leaf in traverse_util.flatten_dict(frozen).items() if leaf.dtype != "bfloat16"}

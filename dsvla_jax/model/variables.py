@@ -16,12 +16,13 @@ Variables = dict[str, Any]
 def split_variables(variables: Variables, regime: str) -> tuple[Variables, Variables]:
     """The variables as (trainable, frozen).
 
-    `full`: everything learns. `lora`: the "lora" collection and the projection learn (paper, section 3.1).
+    `full`: everything learns. `lora`: the "lora" collection and the projection learn (paper, section 3.1). `adapters`:
+    the "lora" collection alone, on a base whose projection is pretrained (as in the authors' released training code).
     """
     flat = traverse_util.flatten_dict(variables)
 
     def learns(path: tuple[str, ...]) -> bool:
-        return regime == "full" or path[0] == "lora" or path[1] == PROJECTION
+        return regime == "full" or path[0] == "lora" or (regime == "lora" and path[1] == PROJECTION)
 
     trainable = {path: leaf for path, leaf in flat.items() if learns(path)}
     frozen = {path: leaf for path, leaf in flat.items() if not learns(path)}

@@ -46,7 +46,7 @@ class Experiment:
     """Open X-Embodiment episodes to learn from instead of `data`."""
     optimizer: OptimizerConfig = OptimizerConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
-    regime: Literal["full", "lora"] = "full"
+    regime: Literal["full", "lora", "adapters"] = "full"
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
     base: str = ""
     """A finished run, or a folder of imported weights (docs/weights.md), whose parameters come in the place of random
@@ -71,8 +71,10 @@ class Experiment:
     """Steps whose loss or gradient is not finite are skipped; a run with more of them stops."""
 
     def __post_init__(self) -> None:
-        if self.regime == "lora" and self.model.lora is None:
-            raise UserError("regime: 'lora' needs adapters, but model.lora is None; give the config a LoraConfig")
+        if self.regime != "full" and self.model.lora is None:
+            raise UserError(
+                f"regime: {self.regime!r} needs adapters, but model.lora is None; give the config a LoraConfig"
+            )
         if self.regime == "full" and self.model.base_dtype != "same":
             raise UserError(
                 f"model.base_dtype: {self.model.base_dtype!r} is for frozen weights, but regime 'full' trains all; "

@@ -68,7 +68,8 @@ def _flops(experiment: Experiment, text: int, passes: Passes) -> dict[str, int]:
         total["vision projection"] = 2 * tokens * vision.width * width * (1 + training + (training and full))
 
     sequence, prompted = text, 0
-    learned = 3 if training else 1
+    projects = experiment.regime != "adapters"
+    learned = 2 + projects if training else 1
     if config.fusion == "prefix":
         sequence += tokens
         hidden = language.width if config.projector == "mlp" else 0
@@ -86,7 +87,7 @@ def _flops(experiment: Experiment, text: int, passes: Passes) -> dict[str, int]:
             ),
             read**2 * prompt.width,
             None,
-            True,
+            projects,
         )
         outside = tokens * width * prompt.width + prompted * prompt.width * (prompt.width + language.width)
         total["projector"] = _block_flops(blocks, config, training) + 2 * outside * learned
