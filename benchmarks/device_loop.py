@@ -1,0 +1,86 @@
+"""The closed loop on the device gives the host loop's episodes on two tasks; episodes/s of both by batch (1 hour).
+
+Usage: python -m benchmarks.device_loop [RUN] [--tasks lamp_on put_rubbish_in_bin] [--batches 4 16]
+
+Both step MJX. An episode agrees if its outcome, its number of key poses and every answer are the same. Rates are of the
+second run of the same start, with everything compiled.
+"""
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tyro
+
+import dsvla_jax.policy
+from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.device_rollout import DeviceRollout, Rollout
+from dsvla_jax.encoding.prompts import format_answer
+from dsvla_jax.policy import Policy
+from dsvla_jax.rollout import Ending, run_episodes
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.training.experiment import load_experiment
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which run, on which tasks, with how many episodes side by side."""
+
+    run: tyro.conf.Positional[Path] = Path("runs/tiny")
+    tasks: tuple[str, ...] = ("lamp_on", "put_rubbish_in_bin")
+    batches: tuple[int, ...] = (4, 16)
+
+
+def agreeing(policy: Policy, endings: list[Ending], rollout: Rollout) -> int:
+    """Episodes that are the same in both."""
+    integers, keyframes = np.asarray(rollout.integers), np.asarray(rollout.keyframes)
+    succeeded, style = np.asarray(rollout.state.verdict.succeeded), policy.config.encoding.style
+    return sum(
+        ending.success == succeeded[i]
+        and ending.keyframes == keyframes[i]
+        and ending.answers == [format_answer(integers[k, i], style) for k in range(keyframes[i])]
+        for i, ending in enumerate(endings)
+    )
+
+
+def timed(what: Any) -> tuple[Any, float]:
+    """The result, and seconds of the second call."""
+    jax.block_until_ready(what())
+    began = time.perf_counter()
+    return jax.block_until_ready(what()), time.perf_counter() - began
+
+
+def main(options: Options) -> int:
+    policy, data = dsvla_jax.policy.load(options.run), load_experiment(options.run / "config.json").data
+    different = 0
+    for task in options.tasks:
+        environment = Environment(task, "mjx", image_size=data.image_size)
+        on_device = DeviceRollout(environment, policy)
+        for batch in options.batches:
+            state = environment.reset(episode_keys(0, "eval", task, 0, batch))
+            rollout, device = timed(lambda state=state, run=on_device: run(state))
+            run_host = lambda state=state, env=environment: run_episodes(env, policy.act, state)  # noqa: E731
+            run_host()
+            began = time.perf_counter()
+            endings = run_host()
+            host = time.perf_counter() - began
+            same = agreeing(policy, endings, rollout)
+            different += batch - same
+            print(
+                f"{task} x {batch}: {same} of {batch} episodes agree, {sum(e.success for e in endings)} succeed; "
+                f"{batch / device:.2f} episodes/s on the device, {batch / host:.2f} from the host",
+                flush=True,
+            )
+    return int(different > 0)
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        parsed = tyro.cli(Options, description=__doc__)
+        configure_jax()
+        sys.exit(main(parsed))

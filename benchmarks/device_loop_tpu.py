@@ -1,0 +1,122 @@
+"""The closed loop with the paper's 7B policy compiles for a TPU v5e 4x4 slice and fits it (20 minutes).
+
+Usage: python -m benchmarks.device_loop_tpu [--task lamp_on] [--episodes 64]
+
+Ahead of time and from any CPU: it needs the libtpu package (pip install "dsvla-jax[planner]"), not a TPU. Exits with 77
+where libtpu is missing, with 1 where the program does not fit. Weights are bfloat16, split over all chips; episodes
+are spread over them. In place of LLaMA's vocabulary, one of 32,000 words, with an integer a token.
+"""
+
+import dataclasses
+import itertools
+import os
+import string
+import sys
+import time
+from typing import Any
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax.experimental import topologies
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from configs.paper_7b import config as paper_7b
+from dsvla_jax.command_line import fail_with_message
+from dsvla_jax.device_rollout import device_loop
+from dsvla_jax.encoding.prompt_table import instruction_tokens
+from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.model.partition import shardings
+from dsvla_jax.model.vla import initialize
+from dsvla_jax.policy import PolicyConfig
+from dsvla_jax.sim.episode import Environment
+
+CHIP_GIB, NO_LIBTPU = 16, 77
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to compile."""
+
+    task: str = "lamp_on"
+    episodes: int = 64
+
+
+def slice_mesh() -> Mesh:
+    """The sixteen chips of a v5e 4x4 slice."""
+    topology = topologies.get_topology_desc(
+        platform="tpu",
+        topology_name="v5e:4x4",
+        chip_config_name="default",
+        chips_per_host_bounds=(2, 2, 1),
+        num_slices=1,
+    )
+    devices = np.array(topology.devices).reshape(1, 16, 1)
+    return Mesh(devices, ("data", "fsdp", "tensor"), axis_types=(AxisType.Auto,) * 3)
+
+
+def words(count: int, instructions: list[str]) -> WordTokenizer:
+    """A word-level tokenizer of so many tokens, which knows the instructions."""
+    known = vocabulary(instructions)
+    missing = count - WordTokenizer(known).vocab_size
+    letters = ("".join(word) for word in itertools.product(string.ascii_lowercase, repeat=4))
+    filler = (word for word in letters if word not in known)
+    return WordTokenizer((*known, *itertools.islice(filler, missing)))
+
+
+def main(options: Options) -> int:
+    try:
+        mesh = slice_mesh()
+    except (RuntimeError, ModuleNotFoundError) as error:
+        print(f"no TPU compiler ({error}): pip install 'dsvla-jax[planner]'", file=sys.stderr)
+        return NO_LIBTPU
+    experiment = paper_7b()
+    model = dataclasses.replace(experiment.model, remat="none")
+    environment = Environment(options.task, "mjx", image_size=experiment.data.image_size)
+    tokenizer = words(model.language.vocab_size, environment.task.all_instructions())
+    policy = PolicyConfig(experiment.encoding, model)
+    said = [environment.task.say(0)] * options.episodes
+    beginnings, lengths = instruction_tokens(tokenizer, policy.encoding, environment.num_arms, said)
+    limit = 2 * environment.expert_keyframes
+    loop = device_loop(environment, policy, tokenizer, limit, beginnings.shape[1])
+
+    variables = jax.eval_shape(lambda: initialize(model, jax.random.key(0)))
+    variables = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.bfloat16), variables)
+    state = jax.eval_shape(
+        environment.reset, jax.eval_shape(lambda: jax.random.split(jax.random.key(0), options.episodes))
+    )
+    spread, everywhere = NamedSharding(mesh, PartitionSpec(("data", "fsdp"))), NamedSharding(mesh, PartitionSpec())
+
+    def placed(tree: Any, sharding: Any) -> Any:
+        if isinstance(sharding, NamedSharding):
+            sharding = jax.tree.map(lambda _: sharding, tree)
+        return jax.tree.map(lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree, sharding)
+
+    inputs = (
+        placed(environment.mjx_model, everywhere),
+        placed(variables, shardings(variables, mesh)),
+        placed(state, spread),
+        *(placed(jax.ShapeDtypeStruct(x.shape, x.dtype), spread) for x in (beginnings, lengths)),
+    )
+    start = time.perf_counter()
+    with jax.set_mesh(mesh):
+        lowered = jax.jit(loop).lower(*inputs)
+        print(f"{options.task}: lowered in {time.perf_counter() - start:.0f} s", flush=True)
+        memory: Any = lowered.compile().memory_analysis()
+    sizes = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+    print(
+        f"{options.task}, {options.episodes} episodes on v5e 4x4: {sizes / 2**30:.2f} GiB of {CHIP_GIB} a chip "
+        f"(arguments {memory.argument_size_in_bytes / 2**30:.2f}, temporary {memory.temp_size_in_bytes / 2**30:.2f}), "
+        f"{time.perf_counter() - start:.0f} s",
+        flush=True,
+    )
+    return int(sizes > CHIP_GIB * 2**30)
+
+
+if __name__ == "__main__":
+    with fail_with_message():
+        sys.exit(main(tyro.cli(Options, description=__doc__)))

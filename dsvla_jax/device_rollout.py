@@ -1,0 +1,129 @@
+"""The closed loop on the device: observe, encode, decode, execute and judge many episodes as one jitted function.
+
+`rollout.run_episodes` is the reference, which asks the policy from the host; both give the same episodes.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from dsvla_jax.encoding.encode import encode_observation
+from dsvla_jax.encoding.grammar import build_answer_grammar
+from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.encoding.prompt_table import instruction_tokens, make_prompt_table, write_prompts
+from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.model.decode import GREEDY, Decoding, decode_actions
+from dsvla_jax.model.variables import Variables
+from dsvla_jax.model.vla import VLA
+from dsvla_jax.policy import Policy, PolicyConfig
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState, jit_with_mjx
+from dsvla_jax.types import Array, ModelInputs
+
+
+@struct.dataclass
+class Rollout:
+    """What became of B episodes of at most L key poses.
+
+    state: the last. integers: int32 (L, B, A, 8), the answers, zero where no key pose was executed any more.
+    keyframes: int32 (B,), how many each episode had.
+    """
+
+    state: SimState
+    integers: Array
+    keyframes: Array
+
+
+Loop = Callable[[Any, Variables, SimState, Array, Array], Rollout]
+
+
+def device_loop(
+    environment: Environment,
+    config: PolicyConfig,
+    tokenizer: Tokenizer,
+    limit: int,
+    longest_instruction: int,
+    decoding: Decoding = GREEDY,
+) -> Loop:
+    """The pure ``(mjx_model, variables, state, beginnings (B, P), lengths (B,)) -> Rollout`` of an MJX environment.
+
+    limit: L. longest_instruction: P, see `prompt_table.instruction_tokens`. ``decoding`` must not sample. Keypoints are
+    those of the given state, the first frame's.
+    """
+    encoding, arms = config.encoding, environment.num_arms
+    table = make_prompt_table(tokenizer, encoding, arms)
+    grammar = build_answer_grammar(tokenizer, arms, encoding.style)
+    size = longest_instruction + table.longest
+
+    def turn(
+        mjx_model: Any, variables: Variables, state: SimState, active: Array, text: tuple[Array, Array]
+    ) -> tuple[SimState, Array]:
+        observation = environment.observe(state)
+        batch = observation.pose.shape[0]
+        integers = encoding.codec.encode(observation.pose, observation.gripper_open).reshape(batch, -1)
+        if encoding.use_keypoints:
+            near = encoding.codec.encode_position(active).reshape(batch, -1)
+            integers = jnp.concatenate([integers, near], axis=1)
+        tokens, mask = write_prompts(table, text[0], text[1], integers, size, tokenizer.pad_id)
+        inputs = ModelInputs(**encode_observation(observation, encoding), text_tokens=tokens, text_mask=mask)
+        answer = decode_actions(VLA(config.model), variables, inputs, grammar, decoding, None).integers
+        return environment.execute_in_mjx(mjx_model, state, encoding.codec.decode(answer)), answer
+
+    def run(mjx_model: Any, variables: Variables, state: SimState, beginnings: Array, lengths: Array) -> Rollout:
+        keypoints = environment.keypoints(state)
+        batch = keypoints.shape[0]
+
+        def going_on(carry: tuple) -> Array:
+            done, state, _, _ = carry
+            return (done < limit) & ~jnp.all(_over(state))
+
+        def step(carry: tuple) -> tuple:
+            done, state, latched, rollout = carry
+            positions = environment.end_effector(state)[0][..., :3]
+            latched = jax.vmap(advance_latch)(latched, positions, keypoints)
+            active = jax.vmap(jax.vmap(active_keypoint))(latched, keypoints)
+            running = ~_over(state)
+            state, answer = turn(mjx_model, variables, state, active, (beginnings, lengths))
+            integers = rollout[0].at[done].set(jnp.where(running[:, None, None], answer, 0))
+            return done + 1, state, latched, (integers, rollout[1] + running)
+
+        start = (jnp.zeros((limit, batch, arms, 8), jnp.int32), jnp.zeros(batch, jnp.int32))
+        latched = jnp.zeros((batch, arms), jnp.int32)
+        _, state, _, (integers, keyframes) = jax.lax.while_loop(
+            going_on, step, (jnp.int32(0), jax.tree.map(jnp.asarray, state), latched, start)
+        )
+        return Rollout(state, integers, keyframes)
+
+    return run
+
+
+def _over(state: SimState) -> Array:
+    return state.verdict.succeeded | state.verdict.failed | state.diverged
+
+
+class DeviceRollout:
+    """Runs a policy's episodes of one task on the device; compiled once for each size of a batch.
+
+    environment: with physics "mjx". limit: key poses after which an episode is over; twice the expert's if not given.
+    """
+
+    def __init__(self, environment: Environment, policy: Policy, limit: int | None = None):
+        self._environment, self._policy = environment, policy
+        encoding, task = policy.config.encoding, environment.task
+        everything = instruction_tokens(policy.tokenizer, encoding, task.num_arms, task.all_instructions())[0]
+        self._longest = everything.shape[1]
+        limit = limit or 2 * environment.expert_keyframes
+        loop = device_loop(environment, policy.config, policy.tokenizer, limit, self._longest, policy.decoding)
+        self._run = jit_with_mjx(loop)
+
+    def __call__(self, state: SimState) -> Rollout:
+        """The episodes of a reset state, each told its task in another way, as `rollout.run_episodes` does."""
+        instructions = self._environment.instructions(state, np.arange(state.qpos.shape[0]))
+        encoding, arms = self._policy.config.encoding, self._environment.num_arms
+        beginnings, lengths = instruction_tokens(self._policy.tokenizer, encoding, arms, instructions)
+        beginnings = np.pad(beginnings, ((0, 0), (0, self._longest - beginnings.shape[1])))
+        return self._run(self._environment.mjx_model, self._policy.variables, state, beginnings, lengths)

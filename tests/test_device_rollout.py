@@ -1,0 +1,27 @@
+"""The closed loop on the device against the one on the host, both stepping MJX."""
+
+import numpy as np
+import pytest
+
+from dsvla_jax.device_rollout import DeviceRollout
+from dsvla_jax.encoding.prompts import format_answer
+from dsvla_jax.rollout import run_episodes
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.seeds import episode_keys
+from tests.serving import SIZE, tiny_policy
+
+
+@pytest.mark.slow
+def test_both_loops_give_the_same_episodes():
+    environment = Environment("lamp_on", "mjx", image_size=SIZE)
+    policy = tiny_policy()
+    state = environment.reset(episode_keys(0, "validation", "lamp_on", 0, 3))
+    endings = run_episodes(environment, policy.act, state, limit=3)
+    rollout = DeviceRollout(environment, policy, limit=3)(state)
+    style = policy.config.encoding.style
+    for i, ending in enumerate(endings):
+        assert rollout.keyframes[i] == ending.keyframes
+        answers = [format_answer(np.asarray(rollout.integers)[k, i], style) for k in range(ending.keyframes)]
+        assert answers == ending.answers
+        assert bool(rollout.state.verdict.succeeded[i]) == ending.success
+    assert len({answer for ending in endings for answer in ending.answers}) > 1
