@@ -84,24 +84,18 @@ def test_a_base_of_other_sizes_names_the_fields(imported):
 
 def test_adapters_of_the_base_need_adapters_in_the_config(tmp_path):
     source = GOLDEN / "original"
-    import_backbones(
-        source / "llama", tmp_path / "base", source / "clip.pt", adapter=source / "adapter.pth", adapter_heads=3
-    )
-    towers = read_towers(tmp_path / "base")
+    adapter, out = source / "adapter.pth", tmp_path / "base"
+    import_backbones(source / "llama", out, source / "clip.pt", adapter=adapter, adapter_heads=3)
+    towers = read_towers(out)
     assert towers.vision is not None
     assert towers.projector is not None
-    model = ModelConfig(
-        vision=towers.vision,
-        language=towers.language,
-        fusion="adapter",
-        visual_prompt=towers.projector,
-        lora=LoraConfig(),
-    )
-    small = small_experiment(regime="lora", base=str(tmp_path / "base"), mesh=MESH)
+    sizes = ModelConfig(towers.vision, towers.language, fusion="adapter", visual_prompt=towers.projector)
+    model = dataclasses.replace(sizes, lora=LoraConfig())
+    small = small_experiment(regime="lora", base=str(out), mesh=MESH)
     with pytest.raises(CheckpointError, match=r"model.lora.rank: the config says 16, the folder 2"):
         start(dataclasses.replace(small, model=model))
     state, _ = start(dataclasses.replace(small, model=dataclasses.replace(model, lora=LoraConfig(rank=2, alpha=2.0))))
-    gate = load_backbones(tmp_path / "base")["params"]["projector"]["gate"]
+    gate = load_backbones(out)["params"]["projector"]["gate"]
     assert np.abs(gate).min() > 0
     np.testing.assert_array_equal(state.trainable["params"]["projector"]["gate"], gate)
 
