@@ -74,7 +74,7 @@ class OpenDataset:
 
     def _samples(self, episode: RldsEpisode, instruction: str, targets: Targets) -> list[EncodedSample]:
         path = f"steps/observation/{self.dataset.images[self.view]}"
-        pictures, steps = episode.encoded(path), self.dataset.steps(episode)
+        pictures, steps = list(episode.encoded(path)), self.dataset.steps(episode)
         cameras, kind = self._cameras(episode), image_format(self.build.features[path])
         return [
             EncodedSample(
@@ -100,7 +100,7 @@ class OpenDataset:
         intrinsics = episode.column(f"steps/observation/{depth.intrinsics}")
         poses = np.linalg.inv(episode.column(f"steps/observation/{depth.camera_from_world}").astype(np.float64))
         path = f"steps/observation/{depth.key}"
-        encoded, kind = episode.encoded(path), image_format(self.build.features[path])
+        encoded, kind = list(episode.encoded(path)), image_format(self.build.features[path])
         return [
             Camera(intrinsics[i], poses[i].astype(np.float32), depth.unit, encoded[i], kind)
             for i in range(episode.num_steps)

@@ -6,6 +6,7 @@ Datasets' feature definitions are used; TensorFlow is not.
 
 import dataclasses
 import zlib
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -104,12 +105,12 @@ class RldsEpisode:
             raise DataError(self.where, path, f"{dtype} {feature.shape} a step", str(error), _FIX) from error
         return array if path.startswith(f"{STEPS}/") else array[0]
 
-    def encoded(self, path: str) -> list[bytes]:
+    def encoded(self, path: str) -> Sequence[bytes]:
         """The undecoded bytes of an image or string feature, one a step."""
         feature = self._feature(path)
         if not (isinstance(feature, Image) or _is_text(feature)):
             raise DataError(self.where, path, "an image or a string", repr(feature), "ask for another feature")
-        values = list(self._raw(path, feature))
+        values = self._raw(path, feature)
         if path.startswith(f"{STEPS}/") and len(values) != self.num_steps:
             raise DataError(self.where, path, f"{self.num_steps} values", str(len(values)), _FIX)
         return values

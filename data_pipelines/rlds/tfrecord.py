@@ -46,10 +46,10 @@ def read_record(file: BinaryIO, offset: int, where: object) -> bytes:
     """The bytes of the record that starts at `offset`, both checksums verified."""
     file.seek(offset)
     length = _length(file.read(HEADER_BYTES), where)
-    data = file.read(length + FOOTER_BYTES)
-    if len(data) != length + FOOTER_BYTES:
-        raise DataError(where, "record", f"{length} bytes", f"{max(len(data) - FOOTER_BYTES, 0)} (truncated)", _FIX)
-    data, stored = data[:length], struct.unpack("<I", data[length:])[0]
+    data, footer = file.read(length), file.read(FOOTER_BYTES)
+    if len(data) + len(footer) != length + FOOTER_BYTES:
+        raise DataError(where, "record", f"{length} bytes and a checksum", f"{len(data)} (truncated)", _FIX)
+    (stored,) = struct.unpack("<I", footer)
     if (crc := masked_crc(data)) != stored:
         raise DataError(where, "CRC of the record", f"{stored:#010x}", f"{crc:#010x}", _FIX)
     return data
