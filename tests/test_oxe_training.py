@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -67,11 +68,11 @@ def test_the_documented_sequence(tmp_path: Path):
     checkpoints.close()
     pose = np.array([[[0.3, -0.1, 1.1, 0, 1, 0, 0]]], np.float32)
     observation = Observation(
-        rgb=np.zeros((1, 96, 96, 3), np.uint8),
-        depth=np.zeros((1, 1, 1), np.float32),
-        camera=Camera(np.eye(3, dtype=np.float32)[None], np.eye(4, dtype=np.float32)[None]),
-        pose=pose,
-        gripper_open=np.ones((1, 1), np.float32),
+        rgb=jnp.zeros((1, 96, 96, 3), jnp.uint8),
+        depth=jnp.zeros((1, 1, 1)),
+        camera=Camera(jnp.eye(3)[None], jnp.eye(4)[None]),
+        pose=jnp.asarray(pose),
+        gripper_open=jnp.ones((1, 1)),
     )
     bare = Policy(dataclasses.replace(policy.config, displacement=None), policy.variables, policy.tokenizer)
     told, answered = (one.act(observation, ["lift the ball"], None).action for one in (policy, bare))

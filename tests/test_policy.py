@@ -59,7 +59,7 @@ def test_few_sizes_are_compiled():
 
 def test_a_run_folder_keeps_the_tokenizer(policy, tmp_path):
     checkpoints = RunCheckpoints(tmp_path)
-    checkpoints.save(1, policy.variables, {"count": np.zeros(1)}, {"position": 0})
+    checkpoints.save(1, {"trainable": policy.variables}, {"iterator": {"position": 0}})
     checkpoints.close()
     save_policy_config(tmp_path, policy.config, policy.tokenizer)
     again = load(tmp_path)
