@@ -155,7 +155,7 @@ def base_variables(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str,
         return {}
     folder = Path(experiment.base)
     if is_imported(folder):
-        return load_for_model(folder, experiment.model, mesh, frozen=experiment.regime == "lora")
+        return load_for_model(folder, experiment.model, mesh, frozen=experiment.regime != "full")
     params = dsvla_jax.policy.load(folder, mesh).variables["params"]
     expected = jax.eval_shape(lambda: initialize(experiment.model, jax.random.key(0)))
     require_same_shapes(params, expected["params"], folder)
