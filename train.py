@@ -35,7 +35,7 @@ from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.training import loop
-from dsvla_jax.training.distributed import Watchdog, start_processes
+from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes
 from dsvla_jax.training.experiment import Experiment, load_experiment, outcome_differences, save_experiment
 from dsvla_jax.training.metrics import MetricsWriter
 from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch
@@ -132,7 +132,8 @@ def open_data(experiment: Experiment, tokenizer: Tokenizer, part: BatchPart) -> 
     if experiment.oxe is not None:
         loader = OxeLoader(experiment.oxe, experiment.encoding, tokenizer, **order)
         return loader, loader.num_samples
-    reader = open_demonstrations(experiment.data, tokenizer)
+    with first_process_first("demonstrations"):
+        reader = open_demonstrations(experiment.data, tokenizer)
     sample = make_sampler(experiment.data, experiment.encoding, tokenizer)
     return make_loader(reader, sample, **order), reader.num_frames
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 from tensorboardX import SummaryWriter
 
 from dsvla_jax.errors import UserError
@@ -15,19 +16,21 @@ FILE = "metrics.jsonl"
 
 
 class MetricsWriter:
-    """Writes one line a step. A run that goes on from a checkpoint first forgets what came after it, so that the file
-    holds each step once.
+    """Writes one line a step, in process 0. A run that goes on from a checkpoint first forgets what came after it, so
+    that the file holds each step once.
 
     step: that of the checkpoint, or 0. wandb_project: the Weights & Biases project to write to as well, if any.
     """
 
     def __init__(self, run: Path, step: int, wandb_project: str = "", config: Mapping[str, Any] | None = None):
-        self._path = run / FILE
-        rewind(self._path, step)
+        writes = jax.process_index() == 0
+        self._path = run / FILE if writes else Path(os.devnull)
+        if writes:
+            rewind(self._path, step)
         self._file = self._path.open("a")
         # TensorBoard hides what an earlier process wrote from this step on.
-        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=step + 1)
-        self._wandb = _start_wandb(run, wandb_project, config or {}) if wandb_project else None
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=step + 1, write_to_disk=writes)
+        self._wandb = _start_wandb(run, wandb_project, config or {}) if wandb_project and writes else None
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Writes the numbers of a step. One that is not finite becomes null in the file."""
@@ -48,7 +51,8 @@ class MetricsWriter:
 
     def sync(self) -> None:
         """Makes sure that the lines survive a power failure. Called before a checkpoint that goes on behind them."""
-        os.fsync(self._file.fileno())
+        if self._path.name == FILE:
+            os.fsync(self._file.fileno())
 
     def __enter__(self) -> "MetricsWriter":
         return self
