@@ -21,21 +21,25 @@ def join_heads(x: Array) -> Array:
     return x.swapaxes(1, 2).reshape(batch, length, heads * depth)
 
 
-def attend(query: Array, key: Array, value: Array, mask: Array | None = None, implementation: str = "by_hand") -> Array:
+def attend(query: Array, key: Array, value: Array, mask: Array | None = None, implementation: str = "auto") -> Array:
     """Softmax attention, the softmax in float32.
 
     query: (B, H, T, D). key, value: (B, Hkv, S, D), H a multiple of Hkv (grouped queries: query head h uses key head
     h // (H / Hkv)). mask: bool, broadcastable to (B, T, S), True where a query may look; None for everywhere.
+    implementation: see ``ModelConfig.attention``.
     Returns (B, H, T, D) in the query's dtype.
     """
     batch, heads, length, depth = query.shape
     kv_heads = key.shape[1]
-    if implementation == "fused":
+    if implementation == "auto":
+        implementation = "by_hand" if jax.default_backend() == "cpu" else "fused"
+    if implementation != "by_hand":
         output = jax.nn.dot_product_attention(
             query.swapaxes(1, 2),
             key.swapaxes(1, 2),
             value.swapaxes(1, 2),
             mask=None if mask is None else mask[:, None],
+            implementation="cudnn" if implementation == "cudnn" else "xla",
         )
         return output.swapaxes(1, 2)
     # The query heads that share a key head are laid out as more queries of it: two plain batched products. The mask is

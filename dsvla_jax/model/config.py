@@ -202,8 +202,9 @@ class ModelConfig:
     remat: what the backward pass computes again, a layer at a time: "none", "full" (everything), "dots" (all but the
         results of products with weights: jax's dots_with_no_batch_dims_saveable), or that policy or another by its
         name in jax.checkpoint_policies.
-    attention: "by_hand" (two batched products over head-major arrays; the quickest on CPU) or "fused"
-        (jax.nn.dot_product_attention).
+    attention: "by_hand" (two batched products over head-major arrays; the quickest on CPU), "fused"
+        (jax.nn.dot_product_attention as XLA compiles it), "cudnn" (the same as one kernel of cuDNN's: NVIDIA, bfloat16,
+        and cuDNN's limits on lengths), or "auto": "by_hand" on a CPU, "fused" elsewhere.
     scan_unroll: layers per iteration of the loop over layers. Compile time grows with it, loop overhead shrinks.
     """
 
@@ -217,7 +218,7 @@ class ModelConfig:
     dtype: Literal["float32", "bfloat16"] = "float32"
     base_dtype: Literal["same", "bfloat16", "int8"] = "same"
     remat: Literal["none", "full", "dots", "dots_saveable", "dots_with_no_batch_dims_saveable"] = "none"
-    attention: Literal["by_hand", "fused"] = "by_hand"
+    attention: Literal["auto", "by_hand", "fused", "cudnn"] = "auto"
     scan_unroll: int = 1
 
     def __post_init__(self):
