@@ -27,8 +27,8 @@ train: setup  ## demonstrations, training, closed-loop evaluation and report for
 	$(PY) eval.py $(RUN) --skip-finished
 	@echo "report: $(RUN)/eval/mujoco.html"
 
-test: setup  ## the test suite
-	$(PY) -m pytest
+test: setup  ## the test suite, on up to four cores
+	$(PY) -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-slow: setup  ## the long tests too
 	$(PY) -m pytest -m "slow or not slow"
