@@ -6,7 +6,8 @@ A run folder holds
                           the data) and `config` (JSON), `metrics` (what the step was judged by), and digests.json, the
                           size and sha256 of every file. It appears whole or not at all
     checkpoints/damaged/  steps whose files are not those that were written, put aside
-    base/                 orbax: the frozen variables, written once; absent when everything is trained
+    base/                 orbax: the frozen variables, written once, with digests.json; absent when everything is
+                          trained
 
 Weights imported from elsewhere are a folder of their own (`dsvla_jax.weights.folder`).
 """
@@ -26,6 +27,7 @@ from flax import traverse_util
 from jax.experimental import multihost_utils
 from orbax.checkpoint.checkpoint_managers import preservation_policy
 
+from dsvla_jax.digests import FILE as DIGESTS
 from dsvla_jax.digests import damage, write_digests
 from dsvla_jax.errors import UserError
 
@@ -165,10 +167,13 @@ class RunCheckpoints:
         return Restored(step, {name: restored[name] for name in arrays}, {name: restored[name] for name in notes})
 
     def save_base(self, frozen: Any) -> None:
-        """Writes the frozen variables, if there are any and they are not there yet."""
-        if jax.tree.leaves(frozen) and not self._base.exists():
+        """Writes the frozen variables, if there are any and they are not there yet, and the digests of their files."""
+        # Without its digests a base is one whose writing was cut short.
+        if jax.tree.leaves(frozen) and not (self._base / DIGESTS).exists():
             with ocp.StandardCheckpointer() as checkpointer:
-                checkpointer.save(self._base, frozen)
+                checkpointer.save(self._base, frozen, force=True)
+            if jax.process_index() == 0:
+                write_digests(self._base, top=True)
 
     def restore_base(self, like: Any) -> Any:
         """The frozen variables, with the structure, shapes and shardings of `like`."""
@@ -176,6 +181,10 @@ class RunCheckpoints:
             return like
         if not self._base.exists():
             raise CheckpointError(f"{self._base}: the frozen base of this run is missing; train the run again")
+        if jax.process_index() == 0 and (problem := damage(self._base)):
+            raise CheckpointError(
+                f"{self._base} is damaged: {problem}; put back a copy of the folder, or train again with another --run"
+            )
         with ocp.StandardCheckpointer() as checkpointer:
             require_same_shapes(checkpointer.metadata(self._base).item_metadata, like, self._base)
             return checkpointer.restore(self._base, _abstract(like))
@@ -227,7 +236,8 @@ class RunCheckpoints:
         # Called in the background when all files of a step are written, before the folder gets its final name.
         if jax.process_index() == 0:
             for folder in self.folder.glob("*.orbax-checkpoint-tmp"):
-                write_digests(folder)
+                # Orbax goes on writing to the files at the top; they hold nothing that is restored.
+                write_digests(folder, top=False)
 
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:

@@ -10,10 +10,9 @@ from pathlib import Path
 FILE = "digests.json"
 
 
-def write_digests(folder: Path) -> None:
-    """Notes size and sha256 of every file in the folder's sub-folders."""
-    # Orbax goes on writing to the files at the top; they hold nothing that is restored.
-    files = sorted(path for item in folder.iterdir() if item.is_dir() for path in item.rglob("*") if path.is_file())
+def write_digests(folder: Path, *, top: bool) -> None:
+    """Notes size and sha256 of every file in the folder's sub-folders and, if asked, of those at its top."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and (top or path.parent != folder))
     digests = {str(path.relative_to(folder)): (path.stat().st_size, file_digest(path)) for path in files}
     (folder / FILE).write_text(json.dumps(digests, indent=1) + "\n")
 

@@ -48,7 +48,8 @@ def save(run: Path, *steps: int, scores: tuple[float | None, ...] = (), keep: in
 
 
 def largest_file(run: Path, step: int) -> Path:
-    return max((run / "checkpoints" / str(step) / "trainable").rglob("*"), key=lambda path: path.stat().st_size)
+    files = (path for path in (run / "checkpoints" / str(step) / "trainable").rglob("*") if path.is_file())
+    return max(files, key=lambda path: path.stat().st_size)
 
 
 def assert_same(one, other) -> None:
@@ -101,6 +102,26 @@ def flip(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
+
+
+def test_a_damaged_base_is_refused(tmp_path: Path):
+    _, frozen = split_variables(variables(1), "lora")
+    with closing(RunCheckpoints(tmp_path)) as checkpoints:
+        checkpoints.save_base(frozen)
+        assert_same(checkpoints.restore_base(frozen), frozen)
+        files = [path for path in (tmp_path / "base").rglob("*") if path.is_file() and path.name != "digests.json"]
+        flip(max(files, key=lambda path: path.stat().st_size))
+        with pytest.raises(CheckpointError, match=r"base is damaged: .*sha256"):
+            checkpoints.restore_base(frozen)
+
+
+def test_a_base_whose_writing_was_cut_short_is_written_again(tmp_path: Path):
+    _, frozen = split_variables(variables(1), "lora")
+    with closing(RunCheckpoints(tmp_path)) as checkpoints:
+        checkpoints.save_base(split_variables(variables(2), "lora")[1])
+        (tmp_path / "base" / "digests.json").unlink()
+        checkpoints.save_base(frozen)
+        assert_same(checkpoints.restore_base(frozen), frozen)
 
 
 @pytest.mark.parametrize(
