@@ -1,5 +1,8 @@
 """Random variations of one recorded frame that keep it true: pure functions of (frame, generator) -> frame.
 
+There is no flip: a mirrored picture is of a left-handed world, in which "left", a clock's hand and a screw mean
+something else.
+
 None of them changes its argument. Compose them in the ``to_sample`` that ``loader.make_loader`` takes.
 """
 
@@ -60,6 +63,43 @@ def perturb_keypoint(frame: Frame, rng: np.random.Generator, max_offset: float, 
         return frame
     noise = rng.uniform(-max_offset, max_offset, frame["keypoint"].shape).astype(np.float32)
     return Frame(**{**frame, "keypoint": frame["keypoint"] + noise})
+
+
+def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
+    """The frame as seen through a window of its picture, at the picture's own size again.
+
+    Colour is interpolated, depth is the nearest pixel's, and the intrinsics move along, so that every reading stays at
+    its place in the world to half a pixel of the picture; poses and keypoints are in the world and stay.
+    """
+    rows, columns = frame["depth"].shape
+    inside = top >= 0 and left >= 0 and top + height <= rows and left + width <= columns
+    if not inside or min(height, width) < 2:
+        raise ValueError(f"crop: expected a window within {rows} x {columns}, got {(top, left, height, width)}")
+    # Corner pixels of the result are corner pixels of the window: integer indices, as in geometry.cameras.
+    scale = np.array([(width - 1) / (columns - 1), (height - 1) / (rows - 1)])
+    u, v = left + np.arange(columns) * scale[0], top + np.arange(rows) * scale[1]
+    maps = [grid.astype(np.float32) for grid in np.meshgrid(u, v)]
+    nearest = np.ix_(np.rint(v).astype(int), np.rint(u).astype(int))
+    intrinsics = frame["intrinsics"].copy()
+    intrinsics[:2, 2] -= [left, top]
+    intrinsics[:2] /= scale[:, None]
+    return Frame(
+        **{
+            **frame,
+            "rgb": cv2.remap(frame["rgb"], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+            "depth": frame["depth"][nearest],
+            "intrinsics": intrinsics,
+        }
+    )
+
+
+def random_crop(frame: Frame, rng: np.random.Generator, least: float) -> Frame:
+    """A random window whose sides are a share of the picture's between `least` and 1; see `crop`."""
+    rows, columns = frame["depth"].shape
+    share = rng.uniform(least, 1)
+    height, width = max(2, round(share * rows)), max(2, round(share * columns))
+    top, left = rng.integers(rows - height + 1), rng.integers(columns - width + 1)
+    return crop(frame, int(top), int(left), height, width)
 
 
 def vary_colour(frame: Frame, rng: np.random.Generator, strength: float = 0.15) -> Frame:

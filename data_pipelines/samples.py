@@ -14,7 +14,7 @@ from functools import cache
 
 import numpy as np
 
-from data_pipelines.augment import jitter_state, perturb_keypoint, random_offset, shift_world, vary_colour
+from data_pipelines.augment import jitter_state, perturb_keypoint, random_crop, random_offset, shift_world, vary_colour
 from data_pipelines.episodes import Frame
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
@@ -46,6 +46,8 @@ def make_sampler(
         if data.shift_world > 0:
             # Horizontal only: the table, and with it the crop of the cloud, keeps its height.
             frame = shift_world(frame, random_offset(rng, (data.shift_world, data.shift_world, 0.0)))
+        if data.crop < 1:
+            frame = random_crop(frame, rng, data.crop)
         if data.colour_variation > 0:
             frame = vary_colour(frame, rng, data.colour_variation)
         if data.state_jitter > 0:

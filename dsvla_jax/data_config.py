@@ -22,6 +22,8 @@ class DataConfig:
     """Metres by which half of the key poses are missed on purpose, so that the next sample starts off the path."""
     shift_world: float = 0.0
     """Metres: pose, keypoints, target and camera are moved by one random offset, so the picture stays true."""
+    crop: float = 1.0
+    """Least share of each side that a random window keeps; its intrinsics move along. 1 turns it off."""
     state_jitter: float = 0.0
     """Metres of noise on the stated current position, on half of the samples."""
     keypoint_noise: float = 0.03

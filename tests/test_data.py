@@ -277,6 +277,49 @@ def test_shift_world_keeps_every_pixel():
     assert shifted["rgb"] is frame["rgb"]
 
 
+def smooth_frame(size=64):
+    """A table 1 m and more before the camera, whose colour is its place in the picture."""
+    frame = decode_frame(random_episode(0, size=size), 0)
+    v, u = np.mgrid[:size, :size]
+    depth = (1 + 0.002 * u + 0.004 * v).astype(np.float32)
+    rgb = np.stack([3 * u, 3 * v, np.full_like(u, 90)], -1).astype(np.uint8)
+    return {**frame, "rgb": rgb, "depth": depth}
+
+
+def world_points(frame):
+    v, u = np.mgrid[: frame["depth"].shape[0], : frame["depth"].shape[1]]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame["intrinsics"].astype(np.float64)).T
+    points = rays * frame["depth"][..., None]
+    return points @ frame["world_from_camera"][:3, :3].T + frame["world_from_camera"][:3, 3]
+
+
+def test_a_crop_keeps_every_point_at_its_place():
+    frame = smooth_frame()
+    for seed in range(20):
+        cropped = augment.random_crop(frame, np.random.default_rng(seed), 0.4)
+        assert cropped["depth"].shape == (64, 64)
+        for name in ("world_from_camera", "pose", "target_pose", "keypoint"):
+            np.testing.assert_array_equal(cropped[name], frame[name])
+        # Where the original camera sees each point of the cropped cloud, its picture has the same colour and depth.
+        for v in range(0, 64, 7):
+            for u in range(0, 64, 7):
+                x, y = project(world_points(cropped)[v, u], frame)
+                np.testing.assert_allclose(cropped["rgb"][v, u, :2], [3 * x, 3 * y], atol=1.1)
+                assert abs(cropped["depth"][v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
+    assert (
+        augment.random_crop(frame, np.random.default_rng(0), 1.0)["intrinsics"].tolist() == frame["intrinsics"].tolist()
+    )
+
+
+def test_a_window_of_the_picture_is_that_window():
+    frame = smooth_frame(65)
+    cropped = augment.crop(frame, 10, 20, 33, 33)
+    np.testing.assert_array_equal(cropped["rgb"][::2, ::2], frame["rgb"][10:43, 20:53])
+    np.testing.assert_allclose(world_points(cropped)[::2, ::2], world_points(frame)[10:43, 20:53], atol=1e-5)
+    with pytest.raises(ValueError, match="crop: expected a window within 65 x 65"):
+        augment.crop(frame, 40, 0, 32, 32)
+
+
 def test_offsets_are_whole_centimetres():
     rng = np.random.default_rng(0)
     offsets = np.stack([augment.random_offset(rng, (0.05, 0.02, 0)) for _ in range(500)])
