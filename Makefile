@@ -34,8 +34,10 @@ test-slow: setup  ## the long tests too
 	$(PY) -m pytest -m "slow or not slow"
 
 parity: setup  ## live comparison with transformers, peft and TensorFlow, which are installed beside the locked packages
-	$(VENV)/bin/uv pip install --quiet --python $(PY) "torch>=2.9" "transformers>=5" "peft>=0.18" "tensorflow-cpu>=2.21"
+	$(VENV)/bin/uv pip install --quiet --python $(PY) "torch>=2.9" "torchvision>=0.24" "transformers>=5" "peft>=0.18" \
+		"pillow>=11" "tensorflow-cpu>=2.21"
 	$(PY) -m pytest -m parity
+	$(PY) -m pytest tests/test_perception.py
 	$(PY) -m benchmarks.rlds_parity
 
 bench: setup  ## list the checks that take minutes
