@@ -78,7 +78,7 @@ def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
     # Corner pixels of the result are corner pixels of the window: integer indices, as in geometry.cameras.
     scale = np.array([(width - 1) / (columns - 1), (height - 1) / (rows - 1)])
     u, v = left + np.arange(columns) * scale[0], top + np.arange(rows) * scale[1]
-    maps = [grid.astype(np.float32) for grid in np.meshgrid(u, v)]
+    across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
     nearest = np.ix_(np.rint(v).astype(int), np.rint(u).astype(int))
     intrinsics = frame["intrinsics"].copy()
     intrinsics[:2, 2] -= [left, top]
@@ -86,7 +86,7 @@ def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
     return Frame(
         **{
             **frame,
-            "rgb": cv2.remap(frame["rgb"], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+            "rgb": cv2.remap(frame["rgb"], across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
             "depth": frame["depth"][nearest],
             "intrinsics": intrinsics,
         }
