@@ -215,6 +215,34 @@ def test_processes_share_the_samples_out(folder):
     ] == whole
 
 
+def test_processes_cut_the_same_batches_and_take_over_from_each_other(folder):
+    """A batch of 4 is the same one whether 1, 2 or 4 processes share it, and a position is good for any of them."""
+
+    def sample(frame, rng):
+        return {"keypoint": augment.perturb_keypoint(frame, rng, 0.03, 0.5)["keypoint"], "frame": frame["frame"]}
+
+    def loaders(count):
+        split = [{"process_index": i, "process_count": count} for i in range(count)]
+        return [make_loader(EpisodeReader(folder), sample, batch_size=4 // count, seed=2, **part) for part in split]
+
+    def whole(parts):
+        return jax.tree.map(lambda *rows: np.concatenate(rows), *[next(part) for part in parts])
+
+    (alone,) = loaders(1)
+    expected = [whole([alone]) for _ in range(7)]
+    position = None
+    for count, batches in ((2, expected[:3]), (4, expected[3:6]), (1, expected[6:])):
+        parts = loaders(count)
+        for part in parts:
+            if position is not None:
+                part.set_state(position)
+        for batch in batches:
+            jax.tree.map(np.testing.assert_array_equal, whole(parts), batch)
+        states = [part.get_state() for part in parts]
+        assert states == [states[0]] * count
+        position = json.loads(json.dumps(states[0]))
+
+
 def test_mixed_arms_need_a_text_sample(tmp_path):
     write_episodes(tmp_path, [random_episode(0), random_episode(1, task="push_box", arms=2)])
     reader = EpisodeReader(tmp_path)
