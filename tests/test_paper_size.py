@@ -104,7 +104,7 @@ def test_the_papers_settings():
 
 def test_a_missing_or_foreign_vocabulary_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"tokenizers/llama/tokenizer\.json is missing; .*--tokenizer"):
+    with pytest.raises(UserError, match=r"tokenizers/llama/tokenizer\.json is missing, .*--tokenizer"):
         tokenizer_of(EXPERIMENT)
     folder = tmp_path / "tokenizers" / "llama"
     folder.mkdir(parents=True)
