@@ -1,7 +1,7 @@
 """The paper's model and finetuning at full size: CLIP ViT-L/14 at 336 pixels, LLaMA-7B, LLaMA-Adapter's prompts.
 
 Adapters in both towers and the projection learn (paper, section 3.1). For one accelerator with 80 GB. Needs, and names
-when missing, LLaMA's vocabulary (`tokenizer`) and a base run with pretrained weights (`base`).
+when missing, LLaMA's vocabulary (`tokenizer`) and a folder of imported weights (`base`).
 
 The paper states 10 epochs of 100 demonstrations a task at 336 pixels; batch size and optimizer are those of the
 authors' released code: AdamW(0.9, 0.95), weight decay 0.05, learning rate 1e-4 batch / 256 with a cosine to zero, no
@@ -38,7 +38,7 @@ def config() -> Experiment:
             learning_rate=1e-4 * BATCH / 256, warmup_steps=0, weight_decay=0.05, gradient_clip=float("inf")
         ),
         regime="lora",
-        base="runs/paper_7b_base",
+        base="bases/paper_7b",
         tokenizer="tokenizers/llama",
         mesh=MeshConfig(data=1, fsdp=-1),
         steps=steps,

@@ -3,7 +3,7 @@
 All of it learns: the vision tower starts from random numbers, so a frozen one would see nothing. The folder of the
 checkpoint is the vocabulary, and what is imported from it the base (docs/weights.md):
 
-    python -m dsvla_jax.weights import SmolLM2-135M weights/smollm2
+    python -m dsvla_jax.weights import SmolLM2-135M bases/smollm2
     python train.py smollm2_sim --tokenizer SmolLM2-135M
 """
 
@@ -33,7 +33,7 @@ def config() -> Experiment:
         encoding=replace(base.encoding, max_text_length=256),
         model=replace(base.model, language=language, scan_unroll=1, remat="full"),
         optimizer=OptimizerConfig(learning_rate=3e-4),
-        base="weights/smollm2",
+        base="bases/smollm2",
         tokenizer="SmolLM2-135M",
         steps=2000,
         batch_size=32,
