@@ -22,7 +22,6 @@ from dsvla_jax.command_line import configure_jax
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.types import ModelInputs
 
 CONFIG = ModelConfig(
@@ -65,7 +64,8 @@ class OurStep:
 
             def loss_of(trainable: Any):
                 logits: Any = model.apply(join_variables(trainable, frozen), inputs)
-                return answer_loss(logits, inputs.text_tokens, answer, answer, None)[0]
+                losses = optax.softmax_cross_entropy_with_integer_labels(logits[:, :-1], inputs.text_tokens[:, 1:])
+                return jnp.where(answer[:, 1:], losses, 0.0).sum() / answer[:, 1:].sum()
 
             loss, gradients = jax.value_and_grad(loss_of)(trainable)
             updates, optimizer_state = optimizer.update(gradients, optimizer_state, trainable)
