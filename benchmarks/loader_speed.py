@@ -79,8 +79,10 @@ def tf_data(folder: Path, frames: int, passes: int = 1) -> dict:
     skip = tfds.decode.SkipDecoding()
     builder = tfds.builder_from_directory(str(folder / NAME / "0.1.0"))
     views = {"image": skip, "wrist_image": skip}
-    episodes = builder.as_dataset(  # pyright: ignore[reportCallIssue]
-        split="train", decoders={"steps": {"observation": views}}, shuffle_files=True
+    episodes = builder.as_dataset(
+        split="train",  # pyright: ignore[reportCallIssue]
+        decoders={"steps": {"observation": views}},
+        shuffle_files=True,
     )
 
     def picture(step):

@@ -17,7 +17,7 @@ import numpy as np
 import optax
 import torch  # pyright: ignore[reportMissingImports]
 
-from benchmarks.torch_peer import TorchVLA, as_torch, torch_inputs
+from benchmarks._torch_peer import TorchVLA, as_torch, torch_inputs
 from dsvla_jax.command_line import configure_jax
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.variables import join_variables, split_variables
