@@ -86,7 +86,7 @@ def our_variables(model: Any, config: ModelConfig) -> Any:
         folder = Path(temporary)
         model.save_pretrained(folder / "source")
         import_backbones(folder / "source", folder / "base")
-        language = load_backbones(folder / "base")["language"]
+        language = load_backbones(folder / "base")["params"]["language"]
     shapes = jax.eval_shape(lambda: initialize(config, jax.random.key(0)))
     rng = np.random.default_rng(0)
     params = jax.tree.map(lambda leaf: rng.normal(0, 0.1, leaf.shape).astype(np.float32), shapes["params"])
