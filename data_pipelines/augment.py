@@ -9,6 +9,7 @@ None of them changes its argument. Compose them in the ``to_sample`` that ``load
 import cv2
 import numpy as np
 
+from data_pipelines.pictures import random_box
 from data_pipelines.records import Frame
 
 
@@ -96,10 +97,7 @@ def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
 def random_crop(frame: Frame, rng: np.random.Generator, least: float) -> Frame:
     """A random window whose sides are a share of the picture's between `least` and 1; see `crop`."""
     rows, columns = frame["depth"].shape
-    share = rng.uniform(least, 1)
-    height, width = max(2, round(share * rows)), max(2, round(share * columns))
-    top, left = rng.integers(rows - height + 1), rng.integers(columns - width + 1)
-    return crop(frame, int(top), int(left), height, width)
+    return crop(frame, *random_box(rng, rows, columns, least))
 
 
 def vary_colour(frame: Frame, rng: np.random.Generator, strength: float = 0.15) -> Frame:

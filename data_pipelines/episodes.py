@@ -4,7 +4,6 @@ A shard is an array_record file (random access by number) of ``records.pack_epis
 its task, frame counts, size and sha256, because array_record itself reads a truncated file as an empty one.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Iterable, Sequence
@@ -23,6 +22,7 @@ from data_pipelines.records import (
     picture_size,
     unpack_episode,
 )
+from dsvla_jax.digests import file_digest
 
 FORMAT_NAME = "dsvla-episodes"
 FORMAT_VERSION = 1
@@ -34,12 +34,6 @@ _ONE_SIZE = "pictures of unlike sizes do not batch: resize them (intrinsics too)
 def shard_name(task: str, number: int) -> str:
     """The file of a task's shard."""
     return f"{task}-{number:05d}.array_record"
-
-
-def file_digest(path: Path) -> str:
-    """sha256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode], **extra: Any) -> dict[str, Any]:

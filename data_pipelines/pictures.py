@@ -13,7 +13,7 @@ Box = tuple[int, int, int, int]
 def random_box(rng: np.random.Generator, height: int, width: int, smallest: float) -> Box:
     """A box with the picture's own proportions, of `smallest` to all of its sides, anywhere inside."""
     part = rng.uniform(smallest, 1.0)
-    rows, columns = max(1, round(height * part)), max(1, round(width * part))
+    rows, columns = max(min(2, height), round(height * part)), max(min(2, width), round(width * part))
     return int(rng.integers(0, height - rows + 1)), int(rng.integers(0, width - columns + 1)), rows, columns
 
 

@@ -193,8 +193,8 @@ def test_a_failed_export_leaves_nothing(run, tmp_path, monkeypatch):
 
 
 def test_what_a_killed_export_left_is_no_hindrance(run, tmp_path):
-    (tmp_path / ".out.partial" / "language").mkdir(parents=True)
-    (tmp_path / ".out.partial" / "language" / "model.safetensors").write_bytes(b"half of it")
+    (tmp_path / "out.partial" / "language").mkdir(parents=True)
+    (tmp_path / "out.partial" / "language" / "model.safetensors").write_bytes(b"half of it")
     export(run[0], tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert not (tmp_path / "out" / "language" / "model.safetensors").exists()

@@ -10,7 +10,6 @@ Each tower is a folder of its own, since PEFT adapts one model, and transformers
     OUT/policy.json the run's own, with every size and the encoding
 """
 
-import contextlib
 import dataclasses
 import shutil
 from collections.abc import Iterator, Mapping
@@ -23,13 +22,14 @@ from flax import traverse_util
 from safetensors.numpy import save_file
 from tqdm import tqdm
 
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, StoredVariable, require_same_shapes
+from dsvla_jax.checkpoints import RunCheckpoints, StoredVariable, require_same_shapes
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.lora import merge_lora, require_mergeable
 from dsvla_jax.model.variables import PROJECTION
 from dsvla_jax.model.vla import initialize
+from dsvla_jax.weights.folder import new_folder
 from dsvla_jax.weights.from_hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
 from dsvla_jax.weights.hugging_face import language_json, vision_json, write_json, write_tensors, write_tokenizer
 from dsvla_jax.weights.towers import AXES
@@ -62,8 +62,11 @@ def export_run(run: Path, out: Path, model: ModelConfig, tokenizer: Tokenizer, o
     Raises CheckpointError where ``out`` exists or the run has not ``model``'s sizes, UserError where there are no
     adapters to write, or where they cannot be merged.
     """
-    if out.exists():
-        raise CheckpointError(f"{out} exists already; remove it, or choose another folder")
+    with new_folder(out) as folder:
+        return _write_run(run, folder, model, tokenizer, options)
+
+
+def _write_run(run: Path, folder: Path, model: ModelConfig, tokenizer: Tokenizer, options: ExportOptions) -> list[str]:
     checkpoints = RunCheckpoints(run, read_only=True)
     variables = checkpoints.list_variables()
     checkpoints.close()
@@ -80,36 +83,21 @@ def export_run(run: Path, out: Path, model: ModelConfig, tokenizer: Tokenizer, o
         except ValueError as error:
             raise UserError(f"{run}: {error}; without --merged they are exported as they are") from error
 
-    with _new_folder(out) as folder:
-        shutil.copy(run / "policy.json", folder)
-        for tower in towers:
-            names, parts = _tensor_names(tower, model), {p: leaf for p, leaf in variables.items() if p[1] == tower}
-            (folder / tower).mkdir()
-            if options.merged:
-                _write_model(folder / tower, parts, names, model.lora, options)
-                _describe_model(folder / tower, tower, model, tokenizer, np.dtype(options.dtype).name)
-            else:
-                _write_adapters(folder / tower, tower, parts, names, model, options)
-        (folder / PROJECTION).mkdir()
-        projection = {".".join(p[2:]): leaf for p, leaf in variables.items() if p[:2] == ("params", PROJECTION)}
-        sizes = {name: leaf.size * np.dtype(options.dtype).itemsize for name, leaf in projection.items()}
-        arrays = ((name, leaf.read().astype(options.dtype)) for name, leaf in projection.items())
-        write_tensors(folder / PROJECTION, sizes, arrays, options.shard_bytes)
+    shutil.copy(run / "policy.json", folder)
+    for tower in towers:
+        names, parts = _tensor_names(tower, model), {p: leaf for p, leaf in variables.items() if p[1] == tower}
+        (folder / tower).mkdir()
+        if options.merged:
+            _write_model(folder / tower, parts, names, model.lora, options)
+            _describe_model(folder / tower, tower, model, tokenizer, np.dtype(options.dtype).name)
+        else:
+            _write_adapters(folder / tower, tower, parts, names, model, options)
+    (folder / PROJECTION).mkdir()
+    projection = {".".join(p[2:]): leaf for p, leaf in variables.items() if p[:2] == ("params", PROJECTION)}
+    sizes = {name: leaf.size * np.dtype(options.dtype).itemsize for name, leaf in projection.items()}
+    arrays = ((name, leaf.read().astype(options.dtype)) for name, leaf in projection.items())
+    write_tensors(folder / PROJECTION, sizes, arrays, options.shard_bytes)
     return [*towers, PROJECTION]
-
-
-@contextlib.contextmanager
-def _new_folder(out: Path) -> Iterator[Path]:
-    """A folder beside ``out`` to write to, which becomes ``out`` at the end, or goes away with what failed."""
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        partial.rename(out)
-    except BaseException:
-        shutil.rmtree(partial)
-        raise
 
 
 def _tensor_names(tower: str, model: ModelConfig) -> dict[str, str]:

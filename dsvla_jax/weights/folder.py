@@ -26,34 +26,44 @@ CHUNK = 2048
 
 
 @contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A folder beside it to write to: it appears when the block ends, and not at all where it raises or is killed.
+
+    Raises CheckpointError where there is one already.
+    """
+    if folder.exists():
+        raise CheckpointError(f"{folder} exists already; remove it, or choose another folder")
+    partial = folder.absolute().with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        partial.rename(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+@contextlib.contextmanager
 def create_weights(
     folder: Path, leaves: Mapping[str, jax.ShapeDtypeStruct], description: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """A new folder of weights: it appears when the block ends, and not at all where it raises or is killed.
+    """A new folder of weights, see `new_folder`.
 
     leaves: by path ("language/layers/q/kernel"). Yields an array on disk for each: ``arrays[path][index] = values``
     writes.
     """
-    if folder.exists():
-        raise CheckpointError(f"{folder} exists already; remove it, or choose another folder")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = folder.absolute().with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with new_folder(folder) as partial:
         # Orbax writes the tree, with one number in each array; the arrays are then made anew in their real sizes.
         tree = traverse_util.unflatten_dict(
             {path: np.zeros((1,) * leaf.ndim, leaf.dtype) for path, leaf in leaves.items()}, sep="/"
         )
-        (partial / PARAMS).mkdir(parents=True)
+        (partial / PARAMS).mkdir()
         handler = ocp.PyTreeCheckpointHandler(use_ocdbt=False)
         handler.save(partial / PARAMS, args=ocp.args.PyTreeSave(tree))  # pyright: ignore[reportArgumentType]
         handler.close()
         yield {path: _create_array(partial, path, leaf) for path, leaf in leaves.items()}
         (partial / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
-        partial.rename(folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
 
 
 def _create_array(folder: Path, path: str, leaf: jax.ShapeDtypeStruct) -> Any:

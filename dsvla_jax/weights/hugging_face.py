@@ -17,8 +17,7 @@ from tokenizers import Tokenizer as FastTokenizer
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LanguageConfig, VisionConfig
-
-INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
+from dsvla_jax.weights.safetensors import INDEX, SINGLE
 
 
 def language_json(config: LanguageConfig, dtype: str) -> dict[str, Any]:
