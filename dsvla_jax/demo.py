@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import jax
 import jax.numpy as jnp
-import jinja2
 import numpy as np
 import tyro
 
@@ -20,7 +19,7 @@ from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.policy import Decision, Policy
-from dsvla_jax.report import mark_targets, png_data, write_whole
+from dsvla_jax.report import mark_targets, png_data, write_html
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
@@ -132,10 +131,10 @@ def main(options: Options) -> None:
         return decision.action, decision.texts
 
     (ending,) = run_episodes(environment, act, state)
-    template = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
-    ).get_template("demo.html.jinja")
-    page = template.render(
+    out = options.out or options.run / "demo.html"
+    write_html(
+        out,
+        Path(__file__).with_name("demo.html.jinja"),
         task=task,
         run=str(options.run),
         seed=options.seed,
@@ -143,8 +142,6 @@ def main(options: Options) -> None:
         steps=steps,
         film=[png_data(cv2.resize(frame, (192, 192), interpolation=cv2.INTER_NEAREST)) for frame in ending.frames],
     )
-    out = options.out or options.run / "demo.html"
-    write_whole(out, page)
     print(f"{'success' if ending.success else ending.reason}: {out}")
 
 

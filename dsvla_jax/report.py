@@ -200,11 +200,9 @@ def write_report(
     the other kind of physics. The page needs no other file and no network.
     """
     rates = success_rates(results)
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters["percent"] = lambda value: f"{100 * value:.1f}"
-    page = environment.get_template("report.html.jinja").render(
+    write_html(
+        Path(path),
+        Path(__file__).with_name("report.html.jinja"),
         title=title,
         physics=", ".join(dict.fromkeys(result.physics for result in results)),
         rates=rates,
@@ -214,7 +212,18 @@ def write_report(
         pictures={key: png_data(film_strip(frames)) for key, frames in (strips or {}).items() if len(frames)},
         comparison=compare_physics(results, other) if other else None,
     )
-    write_whole(Path(path), page)
+
+
+def write_html(file: Path, template: Path, **values: Any) -> None:
+    """Fills in a template; the page appears whole, and needs no other file and no network.
+
+    Its filters: `percent` of a share, and `picture` of uint8 (H, W, 3), which goes into an `img`.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(template.parent), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters |= {"percent": lambda value: f"{100 * value:.1f}", "picture": png_data}
+    write_whole(file, environment.get_template(template.name).render(**values))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,12 +4,11 @@ import dataclasses
 import os
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from dsvla_jax.report import png_data, write_whole
+from dsvla_jax.report import write_html
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,11 +57,7 @@ def print_page(page: Page, console: Console | None = None) -> None:
 
 def write_page(path: str | os.PathLike, page: Page) -> None:
     """The page as one HTML file that needs no other file and no network."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters["picture"] = png_data
-    write_whole(Path(path), environment.get_template("page.html.jinja").render(page=page))
+    write_html(Path(path), Path(__file__).with_name("page.html.jinja"), page=page)
 
 
 def _plain(text: str) -> str:
