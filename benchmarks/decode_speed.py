@@ -34,6 +34,7 @@ from dsvla_jax.model.decode import make_decoder
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
 from dsvla_jax.weights.base import import_backbones, load_backbones
+from dsvla_jax.weights.hugging_face import language_json
 from tests.decoding import log_probability
 from tests.vocabularies import small_tokenizer
 
@@ -66,17 +67,7 @@ def their_model() -> Any:
 
     torch.set_num_threads(cores())
     torch.manual_seed(0)
-    config = transformers.LlamaConfig(
-        vocab_size=LANGUAGE.vocab_size,
-        hidden_size=LANGUAGE.width,
-        num_hidden_layers=LANGUAGE.layers,
-        num_attention_heads=LANGUAGE.heads,
-        num_key_value_heads=LANGUAGE.kv_heads,
-        intermediate_size=LANGUAGE.ffn,
-        rms_norm_eps=LANGUAGE.norm_eps,
-        tie_word_embeddings=True,
-        initializer_range=0.05,
-    )
+    config = transformers.LlamaConfig(**language_json(LANGUAGE, "float32"), initializer_range=0.05)
     return transformers.LlamaForCausalLM(config).eval()
 
 

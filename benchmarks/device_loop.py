@@ -82,5 +82,5 @@ def main(options: Options) -> int:
 if __name__ == "__main__":
     with fail_with_message():
         parsed = tyro.cli(Options, description=__doc__)
-        configure_jax()
+        configure_jax("mjx")
         sys.exit(main(parsed))

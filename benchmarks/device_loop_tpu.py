@@ -9,21 +9,15 @@ are spread over them. In place of LLaMA's vocabulary, one of 32,000 words, with 
 
 import dataclasses
 import itertools
-import os
 import string
 import sys
 import time
 from typing import Any
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 import tyro
-from jax.experimental import topologies
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import NamedSharding, PartitionSpec
 
 from configs.paper_7b import config as paper_7b
 from dsvla_jax.command_line import fail_with_message
@@ -34,6 +28,8 @@ from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.training.chips import find_slice
+from dsvla_jax.training.sharding import MeshConfig, make_mesh
 
 CHIP_GIB, NO_LIBTPU = 16, 77
 
@@ -46,19 +42,6 @@ class Options:
     episodes: int = 64
 
 
-def slice_mesh() -> Mesh:
-    """The sixteen chips of a v5e 4x4 slice."""
-    topology = topologies.get_topology_desc(
-        platform="tpu",
-        topology_name="v5e:4x4",
-        chip_config_name="default",
-        chips_per_host_bounds=(2, 2, 1),
-        num_slices=1,
-    )
-    devices = np.array(topology.devices).reshape(1, 16, 1)
-    return Mesh(devices, ("data", "fsdp", "tensor"), axis_types=(AxisType.Auto,) * 3)
-
-
 def words(count: int, instructions: list[str]) -> WordTokenizer:
     """A word-level tokenizer of so many tokens, which knows the instructions."""
     known = vocabulary(instructions)
@@ -69,11 +52,11 @@ def words(count: int, instructions: list[str]) -> WordTokenizer:
 
 
 def main(options: Options) -> int:
-    try:
-        mesh = slice_mesh()
-    except (RuntimeError, ModuleNotFoundError) as error:
-        print(f"no TPU compiler ({error}): pip install 'dsvla-jax[planner]'", file=sys.stderr)
+    where = find_slice("v5e:4x4")
+    if where.virtual:
+        print("no TPU compiler: pip install 'dsvla-jax[planner]'", file=sys.stderr)
         return NO_LIBTPU
+    mesh = make_mesh(MeshConfig(data=1, fsdp=-1), where.devices)
     experiment = paper_7b()
     model = dataclasses.replace(experiment.model, remat="none")
     environment = Environment(options.task, "mjx", image_size=experiment.data.image_size)

@@ -88,7 +88,7 @@ def torment(name: str, keyframes: int, physics: Literal["mujoco", "mjx"] = "mujo
 
 
 def main(options: Options) -> int:
-    configure_jax()
+    configure_jax(options.physics)
     failed = False
     for name in select_tasks(options.tasks):
         faults = torment(name, options.keyframes, options.physics)

@@ -9,24 +9,21 @@ where libtpu is missing. With --out, tasks that the file already has are not com
 
 import dataclasses
 import json
-import os
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
-
 import jax
+import numpy as np
 import tyro
-from jax.experimental import topologies
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.command_line import fail_with_message
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.training.chips import find_slice
 from dsvla_jax.types import Action, Observation
 
 IMAGE_SIZE, CHIP_GIB, NO_LIBTPU = 128, 16, 77
@@ -39,18 +36,6 @@ class Options:
     tasks: tuple[str, ...] = ("all",)
     episodes: int = 1024
     out: Path | None = None
-
-
-def slice_mesh() -> Mesh:
-    """The four chips of a v5e 2x2 slice as one axis."""
-    topology = topologies.get_topology_desc(
-        platform="tpu",
-        topology_name="v5e:2x2",
-        chip_config_name="default",
-        chips_per_host_bounds=(2, 2, 1),
-        num_slices=1,
-    )
-    return topologies.make_mesh(topology, (4,), ("data",))
 
 
 def compile_keyframe(name: str, episodes: int, mesh: Mesh) -> dict[str, Any]:
@@ -85,11 +70,11 @@ def compile_keyframe(name: str, episodes: int, mesh: Mesh) -> dict[str, Any]:
 
 
 def main(options: Options) -> int:
-    try:
-        mesh = slice_mesh()
-    except (RuntimeError, ModuleNotFoundError) as error:
-        print(f"no TPU compiler ({error}): pip install 'dsvla-jax[planner]'", file=sys.stderr)
+    where = find_slice("v5e:2x2")
+    if where.virtual:
+        print("no TPU compiler: pip install 'dsvla-jax[planner]'", file=sys.stderr)
         return NO_LIBTPU
+    mesh = Mesh(np.array(where.devices), ("data",))
     results = json.loads(options.out.read_text()) if options.out and options.out.exists() else {}
     for name in select_tasks(options.tasks):
         if name not in results:
