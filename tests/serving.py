@@ -9,14 +9,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from dsvla_jax.encoding.encode import EncodingConfig
-from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.geometry.cameras import front_camera
-from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
+from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import Policy, PolicyConfig
 from dsvla_jax.serving.server import Limits, PolicyServer
+from tests.small import small_encoding, small_language, small_vision
 
 SIZE = 32
 PROMPTS = ("turn on the light", "close the fridge", "lift the ball", "press the red button")
@@ -25,17 +24,10 @@ PROMPTS = ("turn on the light", "close the fridge", "lift the ball", "press the 
 def tiny_policy(use_keypoints: bool = True) -> Policy:
     """Random weights, larger than at initialisation, so that different observations get different answers."""
     tokenizer = WordTokenizer(vocabulary(PROMPTS))
-    encoding = EncodingConfig(
-        image_size=32,
-        patch_size=16,
-        points=PointTokenizerConfig(num_points=32, group_sizes=(16, 4), neighbours=4, width=32),
-        style="compact",
-        max_text_length=48,
-        use_keypoints=use_keypoints,
-    )
+    encoding = small_encoding(max_text_length=48, use_keypoints=use_keypoints)
     model = ModelConfig(
-        vision=VisionConfig(image_size=32, patch_size=16, width=32, layers=1, heads=2),
-        language=LanguageConfig(vocab_size=tokenizer.vocab_size, width=32, layers=1, heads=2, kv_heads=2, ffn=64),
+        vision=small_vision(),
+        language=small_language(tokenizer.vocab_size),
     )
     variables = jax.tree.map(lambda x: 3.0 * x, initialize(model, jax.random.key(0)))
     return Policy(PolicyConfig(encoding, model), variables, tokenizer)

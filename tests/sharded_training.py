@@ -13,15 +13,14 @@ import jax
 import numpy as np
 import tyro
 
-from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.number_targets import NumberTargets
-from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
-from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
+from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
 from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
+from tests.small import small_encoding, small_language, small_vision
 
 VOCABULARY = 40
 # One choice of a bin, between four tokens.
@@ -35,17 +34,10 @@ TARGETS = NumberTargets(
 
 def tiny_experiment(fusion: Any = "prefix", points: bool = True, **changes: Any) -> Experiment:
     """Both towers with adapters, and a batch of 16 that learns something in 20 steps."""
-    encoding = EncodingConfig(
-        image_size=32,
-        patch_size=16,
-        points=PointTokenizerConfig(num_points=32, group_sizes=(16, 4), neighbours=4, width=32),
-        style="compact",
-        max_text_length=16,
-        use_points=points,
-    )
+    encoding = small_encoding(max_text_length=16, use_points=points)
     model = ModelConfig(
-        vision=VisionConfig(image_size=32, patch_size=16, width=32, layers=2, heads=2),
-        language=LanguageConfig(vocab_size=VOCABULARY, width=32, layers=2, heads=2, kv_heads=2, ffn=64),
+        vision=small_vision(2),
+        language=small_language(VOCABULARY, 2),
         fusion=fusion,
         visual_prompt=VisualPromptConfig(width=32, layers=2, heads=2, ffn=64),
         lora=LoraConfig(rank=2),

@@ -1,6 +1,5 @@
-"""Episodes on disk, the loader and the augmentations, over small pictures with known contents."""
+"""Episodes on disk, the loader and the generation of demonstrations, over small pictures with known contents."""
 
-import copy
 import dataclasses
 import itertools
 import json
@@ -17,7 +16,6 @@ from data_pipelines.episodes import EpisodeReader, write_episodes
 from data_pipelines.loader import make_loader
 from data_pipelines.records import (
     DataError,
-    Frame,
     decode_depth,
     decode_frame,
     decode_rgb,
@@ -255,100 +253,6 @@ def test_mixed_arms_need_a_text_sample(tmp_path):
     batch = next(make_loader(reader, sample, batch_size=6, seed=0))
     assert sorted(batch["task"]) == [0, 0, 0, 1, 1, 1]
     assert EpisodeReader(tmp_path, tasks=["push_box"]).num_arms == {"push_box": 2}
-
-
-def project(points, frame):
-    """Pixels of world points, written out with homogeneous matrices."""
-    camera = np.linalg.inv(frame["world_from_camera"].astype(np.float64)) @ np.append(points, 1.0)
-    pixel = frame["intrinsics"].astype(np.float64) @ camera[:3]
-    return pixel[:2] / pixel[2]
-
-
-def test_shift_world_keeps_every_pixel():
-    rng = np.random.default_rng(0)
-    frame = decode_frame(random_episode(0), 1)
-    offset = augment.random_offset(rng, (0.3, 0.3, 0.1))
-    shifted = augment.shift_world(frame, offset)
-    for field in ("pose", "target_pose", "keypoint"):
-        np.testing.assert_allclose(
-            project(shifted[field][0, :3], shifted), project(frame[field][0, :3], frame), atol=1e-3
-        )
-        np.testing.assert_allclose(shifted[field][0, :3] - frame[field][0, :3], offset, atol=1e-6)
-    np.testing.assert_array_equal(shifted["pose"][:, 3:], frame["pose"][:, 3:])
-    assert shifted["rgb"] is frame["rgb"]
-
-
-def smooth_frame(size=64):
-    """A table 1 m and more before the camera, whose colour is its place in the picture."""
-    frame = decode_frame(random_episode(0, size=size), 0)
-    v, u = np.mgrid[:size, :size]
-    depth = (1 + 0.002 * u + 0.004 * v).astype(np.float32)
-    rgb = np.stack([3 * u, 3 * v, np.full_like(u, 90)], -1).astype(np.uint8)
-    return Frame(**{**frame, "rgb": rgb, "depth": depth})
-
-
-def world_points(frame):
-    v, u = np.mgrid[: frame["depth"].shape[0], : frame["depth"].shape[1]]
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame["intrinsics"].astype(np.float64)).T
-    points = rays * frame["depth"][..., None]
-    return points @ frame["world_from_camera"][:3, :3].T + frame["world_from_camera"][:3, 3]
-
-
-def test_a_crop_keeps_every_point_at_its_place():
-    frame = smooth_frame()
-    for seed in range(20):
-        cropped = augment.random_crop(frame, np.random.default_rng(seed), 0.4)
-        assert cropped["depth"].shape == (64, 64)
-        for name in ("world_from_camera", "pose", "target_pose", "keypoint"):
-            np.testing.assert_array_equal(cropped[name], frame[name])
-        # Where the original camera sees each point of the cropped cloud, its picture has the same colour and depth.
-        for v in range(0, 64, 7):
-            for u in range(0, 64, 7):
-                x, y = project(world_points(cropped)[v, u], frame)
-                np.testing.assert_allclose(cropped["rgb"][v, u, :2], [3 * x, 3 * y], atol=1.1)
-                assert abs(cropped["depth"][v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
-    assert (
-        augment.random_crop(frame, np.random.default_rng(0), 1.0)["intrinsics"].tolist() == frame["intrinsics"].tolist()
-    )
-
-
-def test_a_window_of_the_picture_is_that_window():
-    frame = smooth_frame(65)
-    cropped = augment.crop(frame, 10, 20, 33, 33)
-    np.testing.assert_array_equal(cropped["rgb"][::2, ::2], frame["rgb"][10:43, 20:53])
-    np.testing.assert_allclose(world_points(cropped)[::2, ::2], world_points(frame)[10:43, 20:53], atol=1e-5)
-    with pytest.raises(ValueError, match="crop: expected a window within 65 x 65"):
-        augment.crop(frame, 40, 0, 32, 32)
-
-
-def test_offsets_are_whole_centimetres():
-    rng = np.random.default_rng(0)
-    offsets = np.stack([augment.random_offset(rng, (0.05, 0.02, 0)) for _ in range(500)])
-    centimetres = offsets * 100
-    np.testing.assert_allclose(centimetres, np.rint(centimetres), atol=1e-5)
-    np.testing.assert_array_equal(np.rint(centimetres).max(0), [5, 2, 0])
-    np.testing.assert_array_equal(np.rint(centimetres).min(0), [-5, -2, 0])
-
-
-def test_noise_changes_what_it_says_and_nothing_else():
-    frame = decode_frame(random_episode(0), 0)
-    before = {name: copy.deepcopy(value) for name, value in frame.items()}
-    variations = {
-        "pose": lambda rng: augment.jitter_state(frame, rng, 0.02, 1.0),
-        "keypoint": lambda rng: augment.perturb_keypoint(frame, rng, 0.03, 1.0),
-        "rgb": lambda rng: augment.vary_colour(frame, rng),
-    }
-    for changed, vary in variations.items():
-        result = vary(np.random.default_rng(1))
-        again = vary(np.random.default_rng(1))
-        for name in frame:
-            np.testing.assert_array_equal(frame[name], before[name])
-            np.testing.assert_array_equal(result[name], again[name])
-            assert np.array_equal(result[name], frame[name]) == (name != changed)
-    moved = variations["keypoint"](np.random.default_rng(2))["keypoint"] - frame["keypoint"]
-    assert 0 < np.abs(moved).max() <= 0.03 + 1e-6
-    assert augment.perturb_keypoint(frame, np.random.default_rng(0), 0.03, 0.0) is frame
-    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0)["rgb"], frame["rgb"])
 
 
 def test_episode_keys_depend_on_the_number_alone():

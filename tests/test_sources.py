@@ -18,15 +18,15 @@ from data_pipelines.vocabulary import main as write_vocabulary
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.number_targets import number_rows
-from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.errors import UserError
-from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
+from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
 from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests import rlbench_files as files
+from tests.small import small_encoding, small_language, small_vision
 
 TASKS = ["lamp_on", "bimanual_lift_ball"]
 
@@ -76,16 +76,10 @@ def test_an_imported_folder_is_learned(folder):
     """One and two arms in a batch; a few steps on it fit it better."""
     tokenizer = suite_tokenizer()
     experiment = Experiment(
-        encoding=EncodingConfig(
-            image_size=32,
-            patch_size=16,
-            points=PointTokenizerConfig(num_points=32, group_sizes=(16, 4), neighbours=4, width=32),
-            style="compact",
-            max_text_length=56,
-        ),
+        encoding=small_encoding(max_text_length=56),
         model=ModelConfig(
-            vision=VisionConfig(image_size=32, patch_size=16, width=32, layers=1, heads=2),
-            language=LanguageConfig(vocab_size=tokenizer.vocab_size, width=32, layers=1, heads=2, kv_heads=2, ffn=64),
+            vision=small_vision(),
+            language=small_language(tokenizer.vocab_size),
         ),
         data=data_config(folder),
         optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=1),

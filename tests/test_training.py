@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.encoding.encode import EncodingConfig, encode_text
+from dsvla_jax.encoding.encode import encode_text
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.number_targets import NumberTargets, number_rows
-from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
-from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
+from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
 from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
+from tests.small import small_encoding, small_language, small_vision
 from tests.vocabularies import KINDS, small_tokenizer
 
 VOCABULARY = 40
@@ -29,16 +29,10 @@ NO_NUMBERS = NumberTargets(np.zeros(1, np.int32), np.full((1, 1), np.inf, np.flo
 
 def small_experiment(**changes) -> Experiment:
     return Experiment(
-        encoding=EncodingConfig(
-            image_size=32,
-            patch_size=16,
-            points=PointTokenizerConfig(num_points=32, group_sizes=(16, 4), neighbours=4, width=32),
-            style="compact",
-            max_text_length=16,
-        ),
+        encoding=small_encoding(max_text_length=16),
         model=ModelConfig(
-            vision=VisionConfig(image_size=32, patch_size=16, width=32, layers=1, heads=2),
-            language=LanguageConfig(vocab_size=VOCABULARY, width=32, layers=2, heads=2, kv_heads=2, ffn=64),
+            vision=small_vision(),
+            language=small_language(VOCABULARY, 2),
             lora=LoraConfig(rank=2),
         ),
         steps=10,
