@@ -22,11 +22,11 @@ import tyro
 import dsvla_jax.policy
 from configs import config_names, get_config
 from data_pipelines.loader import make_loader
-from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.samples import make_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
@@ -84,14 +84,13 @@ def train(
     wandb: str,
 ) -> signal.Signals | None:
     """Trains from the newest checkpoint, or from the beginning. Returns the signal that stopped it, if one did."""
-    batches, samples = open_data(experiment, tokenizer, part)
+    batches, samples, displacement = open_data(experiment, tokenizer, part)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
     state, frozen = make_sharded(start, mesh, base_variables(experiment, mesh))
     report_size(state.trainable, frozen, samples)
 
     save_experiment(run / "config.json", experiment)
-    displacement = batches.scale if isinstance(batches, OxeLoader) else None
     save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model, displacement), tokenizer)
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
@@ -121,8 +120,12 @@ def train(
         )
 
 
-def open_data(experiment: Experiment, tokenizer: Tokenizer, part: BatchPart) -> tuple[Any, int]:
-    """The batches of this process, as an iterator with a position to save, and the number of different samples."""
+def open_data(
+    experiment: Experiment, tokenizer: Tokenizer, part: BatchPart
+) -> tuple[Any, int, DisplacementScale | None]:
+    """The batches of this process, as an iterator with a position to save; the number of different samples; and what
+    displacements are binned over, where the targets are such.
+    """
     order: dict[str, Any] = {
         "batch_size": part.size,
         "seed": experiment.seed,
@@ -130,12 +133,15 @@ def open_data(experiment: Experiment, tokenizer: Tokenizer, part: BatchPart) -> 
         "process_count": part.count,
     }
     if experiment.oxe is not None:
+        # Its feature definitions take a second to import, which no other run needs.
+        from data_pipelines.oxe.loader import OxeLoader
+
         loader = OxeLoader(experiment.oxe, experiment.encoding, tokenizer, **order)
-        return loader, loader.num_samples
+        return loader, loader.num_samples, loader.scale
     with first_process_first("demonstrations"):
         reader = open_demonstrations(experiment.data, tokenizer)
     sample = make_sampler(experiment.data, experiment.encoding, tokenizer)
-    return make_loader(reader, sample, **order), reader.num_frames
+    return make_loader(reader, sample, **order), reader.num_frames, None
 
 
 def tokenizer_of(experiment: Experiment) -> Tokenizer:
