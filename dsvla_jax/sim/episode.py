@@ -72,7 +72,7 @@ class Environment:
         self._expert = jax.jit(jax.vmap(lambda state: self.task.expert(self.view(state))))
         if physics == "mujoco":
             stepper = physics_module.mujoco_stepper(self.scene.mj_model, resize="instance" in self.shifts)
-            self._execute = self._execute_on(stepper, jax.jit)
+            self._execute = self._execute_on(stepper, physics_module.jit_on_one_thread)
         elif physics == "mjx":
             stepper = physics_module.mjx_stepper(self.scene.mj_model, resize="instance" in self.shifts)
             self.mjx_model, self.execute_in_mjx = stepper.mjx_model, self._execute_mjx(stepper)

@@ -39,9 +39,10 @@ def _rotation_from_wxyz(quaternion: np.ndarray) -> np.ndarray:
     )
 
 
-_LINK_ROTATIONS = np.stack([_rotation_from_wxyz(q) for q in robot.LINK_QUATERNIONS_WXYZ])
+# Rounded, as quarter turns are exactly that.
+_LINK_ROTATIONS = np.stack([_rotation_from_wxyz(q) for q in robot.LINK_QUATERNIONS_WXYZ]).round(12)
 # The hand and the tool centre point are rigid behind the last joint: one transform.
-_TOOL_ROTATION = _LINK_ROTATIONS[7] @ _rotation_from_wxyz(robot.TCP_QUATERNION_WXYZ)
+_TOOL_ROTATION = (_LINK_ROTATIONS[7] @ _rotation_from_wxyz(robot.TCP_QUATERNION_WXYZ)).round(12)
 _TOOL_POSITION = robot.LINK_POSITIONS[7] + _LINK_ROTATIONS[7] @ robot.TCP_POSITION
 
 
@@ -55,20 +56,26 @@ class Chain(NamedTuple):
     position: Array
 
 
+def _combine(columns: tuple[Array, Array, Array], weights: np.ndarray) -> Array | float:
+    """The sum of three vectors times constants (3,). Written out because most are 0 or 1, and because products of 3x3
+    matrices one by one cost a CPU more in calls than in arithmetic."""
+    return sum(column if w == 1 else column * np.float32(w) for column, w in zip(columns, weights, strict=True) if w)
+
+
 def _chain(joints: Array, base: Array) -> Chain:
-    rotation, position = quaternion_to_matrix(base[3:]), base[:3]
+    matrix, position = quaternion_to_matrix(base[3:]), base[:3]
+    columns = (matrix[:, 0], matrix[:, 1], matrix[:, 2])
     axes, origins = [], []
     cosines, sines = jnp.cos(joints), jnp.sin(joints)
     for i in range(7):
-        position = position + rotation @ jnp.asarray(robot.LINK_POSITIONS[i], jnp.float32)
-        rotation = rotation @ jnp.asarray(_LINK_ROTATIONS[i], jnp.float32)
-        axes.append(rotation[:, 2])
+        position = position + _combine(columns, robot.LINK_POSITIONS[i])
+        x, y, z = (_combine(columns, weights) for weights in _LINK_ROTATIONS[i].T)
+        axes.append(z)
         origins.append(position)
         c, s = cosines[i], sines[i]
-        x, y = rotation[:, 0], rotation[:, 1]
-        rotation = jnp.stack([c * x + s * y, c * y - s * x, rotation[:, 2]], axis=1)
-    position = position + rotation @ jnp.asarray(_TOOL_POSITION, jnp.float32)
-    rotation = rotation @ jnp.asarray(_TOOL_ROTATION, jnp.float32)
+        columns = (c * x + s * y, c * y - s * x, z)
+    position = position + _combine(columns, _TOOL_POSITION)
+    rotation = jnp.stack([_combine(columns, weights) for weights in _TOOL_ROTATION.T], axis=1)
     return Chain(jnp.stack(axes), jnp.stack(origins), rotation, position)
 
 
@@ -93,27 +100,14 @@ def _pose_error(chain: Chain, target: Array) -> Array:
 
 
 def _solve_spd(matrix: Array, right: Array) -> Array:
-    """Solves a small symmetric positive definite system, matrix (n, n), right (n,), by an unrolled Cholesky.
+    """Solves a small symmetric positive definite system, matrix (n, n), right (n,), by unrolled Gauss-Jordan steps.
 
     Batches of such small systems are slow through LAPACK on a CPU and through general solvers on accelerators.
     """
-    n = matrix.shape[0]
-    entries, factor = [right[i] for i in range(n)], []
-    for i in range(n):
-        pivot = jax.lax.rsqrt(matrix[i, i])
-        column = matrix[:, i] * pivot
-        # forward substitution goes along: the entries become those of inverse(L) right
-        entries[i] = entries[i] * pivot
-        for j in range(i + 1, n):
-            entries[j] = entries[j] - column[j] * entries[i]
-        matrix = matrix - jnp.outer(column, column)
-        factor.append((column, pivot))
-    for i in reversed(range(n)):
-        column, pivot = factor[i]
-        for j in range(i + 1, n):
-            entries[i] = entries[i] - column[j] * entries[j]
-        entries[i] = entries[i] * pivot
-    return jnp.stack(entries)
+    rows = jnp.concatenate([matrix, right[:, None]], axis=1)
+    for i, unit in enumerate(np.eye(len(right), dtype=np.float32)):
+        rows = rows - jnp.outer(rows[:, i] - unit, rows[i] / rows[i, i])
+    return rows[:, -1]
 
 
 def track(targets: Array, seed: Array, base: Array) -> Array:

@@ -338,6 +338,13 @@ def jit_with_mjx(function: Callable[..., Any], **options: Any) -> Any:
     return jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": False} if affected else None, **options)
 
 
+def jit_on_one_thread(function: Callable[..., Any]) -> Any:
+    """``jax.jit`` for programs of many tiny matrix products one after the other, such as inverse kinematics: on a CPU,
+    to hand them to a pool of threads takes longer than to multiply them."""
+    options = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
+    return jax.jit(function, compiler_options=options)
+
+
 def mjx_stepper(model: mujoco.MjModel, resize: bool = False) -> MjxStepper:
     """The MJX stepper of ``model``; see the module's words for the signature. resize: episodes have their own sizes."""
     return MjxStepper(model, resize)
