@@ -25,7 +25,7 @@ from data_pipelines.loader import make_loader
 from data_pipelines.samples import make_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
-from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
@@ -207,6 +207,7 @@ def command_line(arguments: list[str]) -> None:
         sys.exit(0 if arguments else 2)
     name, *rest = arguments
     experiment = get_config(name)
+    keep_freed_memory()
     start_processes()
     configure_jax()
 

@@ -18,7 +18,7 @@ import optax
 import torch  # pyright: ignore[reportMissingImports]
 
 from benchmarks._torch_peer import TorchVLA, as_torch, torch_inputs
-from dsvla_jax.command_line import configure_jax
+from dsvla_jax.command_line import configure_jax, keep_freed_memory
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
@@ -141,6 +141,7 @@ def compare(regime: str) -> float:
 
 
 if __name__ == "__main__":
+    keep_freed_memory()  # as train.py does
     configure_jax()
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     ratios = [compare(regime) for regime in sys.argv[1:] or ("lora", "full")]

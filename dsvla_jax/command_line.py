@@ -1,6 +1,7 @@
 """What the two programs and the `python -m` commands have in common at their outermost edge."""
 
 import contextlib
+import ctypes
 import os
 import sys
 from collections.abc import Iterator
@@ -41,3 +42,21 @@ def configure_jax(physics: str = "mujoco") -> None:
     if jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+# From glibc's malloc.h: how many blocks may be pages of their own, the free memory at the end that is handed back, and
+# how many heaps there are.
+M_MMAP_MAX, M_TRIM_THRESHOLD, M_ARENA_MAX = -4, -1, -8
+
+
+def keep_freed_memory() -> None:
+    """Keeps what is freed for the process's next use instead of handing it back to the system. Call it before threads
+    start; without glibc it does nothing.
+
+    XLA's CPU client allocates a program's temporaries anew at every call. As blocks of their own they would come as
+    fresh pages each time, and to fault those in takes a fifth of a training step.
+    """
+    with contextlib.suppress(AttributeError, OSError):
+        mallopt = ctypes.CDLL(None).mallopt
+        for parameter, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1), (M_ARENA_MAX, 1)):
+            mallopt(parameter, value)
