@@ -12,7 +12,7 @@ from dsvla_jax.model.attention import attend
 from dsvla_jax.model.clip import patchify
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.llama import rotary_tables, rotate
-from dsvla_jax.model.lora import LoraDense, merge_lora, unmerge_lora
+from dsvla_jax.model.lora import LoraDense, adapted_product, merge_lora, unmerge_lora
 from dsvla_jax.model.vla import VLA, embed_numbers, initialize, number_embeddings
 from dsvla_jax.types import ModelInputs
 
@@ -232,6 +232,23 @@ def test_merge_and_unmerge(adapted, forward):
     np.testing.assert_allclose(forward(merged, inputs), forward(adapted, inputs), atol=2e-4)
     back = unmerge_lora(merged, adapted["lora"], LORA)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), back, adapted)
+
+
+def test_adapted_product_and_its_gradients_are_those_of_the_sum():
+    keys = jax.random.split(jax.random.key(0), 5)
+    shapes = ((40, 12), (12, 20), (12, 3), (3, 20), (40, 20))
+    *arguments, weights = (jax.random.normal(key, shape) for key, shape in zip(keys, shapes, strict=True))
+
+    def formed(*arguments):
+        return jnp.sum(weights * jnp.tanh(adapted_product(*arguments)))
+
+    def added(x, kernel, a, b):
+        return jnp.sum(weights * jnp.tanh(x @ kernel + (x @ a) @ b))
+
+    for ours, expected in zip(
+        jax.grad(formed, (0, 1, 2, 3))(*arguments), jax.grad(added, (0, 1, 2, 3))(*arguments), strict=True
+    ):
+        np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_merging_adapters_of_another_model_names_the_layer(adapted):

@@ -34,6 +34,28 @@ def _adapter_init(kind: str) -> Initializer:
     return nn.initializers.variance_scaling(1.0 / 3.0, "fan_in", "uniform")
 
 
+@jax.custom_vjp
+def adapted_product(x: Array, kernel: Array, a: Array, b: Array) -> Array:
+    """x (N, in) times W + A B, which is formed: kernel (in, out), a (in, rank), b (rank, out).
+
+    For many rows that is quicker than x W + (x A) B, whose thin products a CPU is slow at. The gradients are those of
+    the sum, without the one of W where nobody asks for it. W + A B in 16 bits would round the adapter away.
+    """
+    return x @ (kernel + a @ b)
+
+
+def _adapted_forward(x: Array, kernel: Array, a: Array, b: Array) -> tuple[Array, tuple[Array, ...]]:
+    return adapted_product(x, kernel, a, b), (x, kernel, a, b)
+
+
+def _adapted_backward(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, ...]:
+    x, kernel, a, b = saved
+    return gradient @ (kernel + a @ b).T, x.T @ gradient, x.T @ (gradient @ b.T), (x @ a).T @ gradient
+
+
+adapted_product.defvjp(_adapted_forward, _adapted_backward)
+
+
 class LoraDense(nn.Module):
     """y = x W + b + (alpha / rank) x A B over the last axis of x.
 
@@ -56,19 +78,27 @@ class LoraDense(nn.Module):
         leading = x.shape[:-1]
         x = x.reshape(-1, inputs).astype(self.dtype)
         kernel = self.param("kernel", self.kernel_init, (inputs, self.features), jnp.float32)
-        y = x @ kernel.astype(self.dtype)
-        if self.has_variable("params", SCALE):
-            y = y * self.get_variable("params", SCALE).astype(self.dtype)
-        if self.use_bias:
-            bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
-            y = y + bias.astype(self.dtype)
+        quantized = self.has_variable("params", SCALE)
         lora = self.lora
         present = self.is_initializing() or self.has_variable("lora", "a")
+        a = b = None
         if adapted and lora is not None and self.name in lora.targets and present:
             a_init = _adapter_init(lora.init)
             a = self.variable("lora", "a", lambda: a_init(self.make_rng("params"), (inputs, lora.rank), jnp.float32))
             b = self.variable("lora", "b", lambda: jnp.zeros((lora.rank, self.features), jnp.float32))
-            y = y + (x @ a.value.astype(self.dtype)) @ b.value.astype(self.dtype) * lora.scale
+            a, b = a.value.astype(self.dtype), b.value.astype(self.dtype) * lora.scale
+        formed = self.dtype == jnp.float32 and not quantized and len(x) > inputs
+        if a is not None and formed:
+            y = adapted_product(x, kernel.astype(self.dtype), a, b)
+        else:
+            y = x @ kernel.astype(self.dtype)
+            if quantized:
+                y = y * self.get_variable("params", SCALE).astype(self.dtype)
+            if a is not None:
+                y = y + (x @ a) @ b
+        if self.use_bias:
+            bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
+            y = y + bias.astype(self.dtype)
         return y.reshape(*leading, self.features)
 
 
