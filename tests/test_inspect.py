@@ -39,7 +39,7 @@ def make_episode(number=0, **changes):
 
 def look(folder, episodes, **options):
     write_episodes(folder, episodes)
-    return describe(Options(folder, **options))
+    return describe(Options(str(folder), **options))[0]
 
 
 def table(page, caption):
@@ -65,7 +65,7 @@ def test_counts_features_and_statistics_are_those_of_the_folder(tmp_path):
 
 def test_the_page_shows_frames_clouds_prompts_and_answers(tmp_path, capsys):
     write_episodes(tmp_path, [make_episode(i) for i in range(4)])
-    main(Options(tmp_path, episodes=2))
+    main(Options(str(tmp_path), episodes=2))
     assert "page: " in capsys.readouterr().out
     text = (tmp_path / "inspect.html").read_text()
     assert text.count("<h2>") == 2
@@ -108,7 +108,7 @@ def test_printing_takes_brackets_as_they_are(tmp_path):
 
 def test_other_folders_are_refused_with_what_to_do(tmp_path):
     with pytest.raises(DataError, match=r"expected demonstrations .*docs/data_own.md"):
-        describe(Options(tmp_path))
+        describe(Options(str(tmp_path)))
     (tmp_path / "lamp_on" / "all_variations" / "episodes" / "episode0").mkdir(parents=True)
     with pytest.raises(DataError, match=r"import them first: python -m data_pipelines.rlbench"):
-        describe(Options(tmp_path))
+        describe(Options(str(tmp_path)))

@@ -1,10 +1,12 @@
-"""Look at data before training on it: python -m data_pipelines.inspect PATH [--page FILE.html]
+"""Look at data before training on it: python -m data_pipelines.inspect PATH|DATASET [--page FILE.html]
 
-PATH is a folder of demonstrations: generated, imported or one's own. Prints features, counts and statistics,
+PATH is a folder of demonstrations (generated, imported or one's own) or of an RLDS build, which may be a URL; DATASET
+is a name of `python -m data_pipelines.oxe list` whose build is in --oxe.folder. Prints features, counts and statistics,
 warns of what is mostly a mistake, and writes an HTML page with frames, clouds, actions and prompts.
 """
 
 import dataclasses
+import os
 from pathlib import Path
 
 import tyro
@@ -14,6 +16,7 @@ from data_pipelines.inspect.episodes import describe_episodes
 from data_pipelines.inspect.page import Page, print_page, write_page
 from data_pipelines.records import DataError
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.prompts import Style
 
@@ -22,38 +25,50 @@ from dsvla_jax.encoding.prompts import Style
 class Options:
     """Options of the command line."""
 
-    path: tyro.conf.Positional[Path]
-    """A folder of demonstrations."""
+    path: tyro.conf.Positional[str]
+    """A folder of demonstrations, an RLDS build, or the name of a dataset."""
     page: Path | None = None
-    """The HTML file to write; PATH/inspect.html if not given."""
+    """The HTML file to write; PATH/inspect.html, or where that cannot be written inspect.html here, if not given."""
     tasks: tuple[str, ...] = ()
-    """Names of tasks; all that are there if not given."""
+    """Names of tasks, of demonstrations; all that are there if not given."""
     episodes: int = 3
-    """Episodes of each task to draw."""
+    """Episodes of each task, or of an RLDS build, to draw."""
     style: Style = "compact"
     """Of the prompts on the page."""
     workspace_low: tuple[float, float, float] = EncodingConfig.workspace_low
     workspace_high: tuple[float, float, float] = EncodingConfig.workspace_high
     """Corners of the box that clouds are cut to, metres, as in the config to train with."""
+    oxe: OxeConfig = dataclasses.field(default_factory=lambda: OxeConfig(mixture=()))
+    """Of RLDS builds, as in the config to train with. With a mixture, displacements are binned over that."""
 
 
-def describe(options: Options) -> Page:
-    """The page of whatever is at the path. Raises DataError where it is nothing that can be read."""
-    path = options.path
+def describe(options: Options) -> tuple[Page, str]:
+    """The page of whatever is at the path, and the folder that it is about.
+
+    Raises UserError where it is nothing that can be read.
+    """
+    encoding = EncodingConfig(
+        workspace_low=options.workspace_low, workspace_high=options.workspace_high, style=options.style
+    )
+    path = Path(options.path)
     if (path / INDEX_FILE).exists():
-        encoding = EncodingConfig(workspace_low=options.workspace_low, workspace_high=options.workspace_high)
-        return describe_episodes(path, options.tasks or None, options.episodes, encoding, options.style)
-    fix = "generate, import or write demonstrations first (docs/data_own.md)"
+        return describe_episodes(path, options.tasks or None, options.episodes, encoding), options.path
+    fix = "generate, import or write demonstrations first (docs/data_own.md), or give an RLDS build (docs/data_oxe.md)"
     if any(found for depth in range(1, 4) for found in path.glob("*/" * depth + "episodes/episode0")):
         fix = f"import them first: python -m data_pipelines.rlbench {path} OUT, and look at OUT"
-    raise DataError(path, "folder", f"demonstrations ({INDEX_FILE})", "none", fix)
+        raise DataError(path, "folder", f"demonstrations ({INDEX_FILE})", "RLBench's", fix)
+    # Its feature definitions take a second to import, which demonstrations do not need.
+    from data_pipelines.inspect.rlds import describe_build, find_dataset
+
+    build, dataset = find_dataset(options.path, options.oxe, fix)
+    return describe_build(build, dataset, options.oxe, options.episodes, encoding), build.folder
 
 
 def main(options: Options) -> None:
     """Describes what is at the path."""
-    page = describe(options)
+    page, folder = describe(options)
     print_page(page)
-    file = options.page or options.path / "inspect.html"
+    file = options.page or Path(folder if os.access(folder, os.W_OK) else ".") / "inspect.html"
     write_page(file, page)
     print(f"page: {file}")
 

@@ -12,7 +12,7 @@ from data_pipelines.inspect.page import Page, Section, Table
 from data_pipelines.records import Episode, Frame, decode_frame
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
-from dsvla_jax.encoding.prompts import Style, format_answer
+from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.geometry.rotations import rotation_distance
 from dsvla_jax.report import film_strip
 
@@ -35,9 +35,7 @@ IDLE_MOVE, IDLE_TURN = 0.01, np.deg2rad(3)
 FAR_KEYPOINT = 0.1
 
 
-def describe_episodes(
-    folder: Path, tasks: Sequence[str] | None, shown: int, encoding: EncodingConfig, style: Style
-) -> Page:
+def describe_episodes(folder: Path, tasks: Sequence[str] | None, shown: int, encoding: EncodingConfig) -> Page:
     """The page of a folder of episodes. shown: how many episodes of each task are drawn."""
     reader = EpisodeReader(folder, tasks=tasks)
     episodes = [reader.episode(number) for number in range(len(reader))]
@@ -47,7 +45,7 @@ def describe_episodes(
     looks = [_look(frame, encoding) for frame in frames]
     by_task = {task: [x for x in episodes if x.task == task] for task in reader.tasks}
     sections = [
-        _section(episode, number, dataclasses.replace(encoding, style=style))
+        _section(episode, number, encoding)
         for group in by_task.values()
         for number, episode in enumerate(group[:shown])
     ]

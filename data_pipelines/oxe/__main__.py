@@ -63,7 +63,7 @@ def prepare(config: Annotated[OxeConfig, tyro.conf.arg(name="")], seed: int = 0)
     for where, why in source.left_out:
         print(f"left out: {where}: {why}")
     if config.target == "relative":
-        scale = MixtureScale(source).scale
+        scale = MixtureScale(source.datasets, source.shares).scale
         print("displacement from", np.round(scale.low, 4), "to", np.round(scale.high, 4), "(metres and radians)")
 
 

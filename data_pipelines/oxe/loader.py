@@ -51,7 +51,7 @@ class OxeLoader(Iterator[Sample]):
                     f"encoding.use_points: {', '.join(flat)} have no calibrated depth; set it to False, or choose"
                     " datasets that have"
                 )
-        mixture_scale = MixtureScale(self.source) if config.target == "relative" else None
+        mixture_scale = MixtureScale(self.source.datasets, self.source.shares) if config.target == "relative" else None
         self.scale: DisplacementScale | None = mixture_scale.scale if mixture_scale else None
         self.left_out = _Reported(self.source.left_out)
         to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self.left_out.append)

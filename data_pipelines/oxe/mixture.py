@@ -3,6 +3,7 @@
 import dataclasses
 import operator
 import threading
+from collections.abc import Sequence
 from typing import SupportsIndex
 
 import grain
@@ -53,14 +54,13 @@ class EncodedSample:
 class OpenDataset:
     """One dataset of the mixture: its build, its index, and its episodes one by one."""
 
-    def __init__(self, dataset: OxeDataset, config: OxeConfig, progress: bool = True):
-        self.dataset, self.config = dataset, config
-        self.build = RldsBuild(_folder_of(dataset, config))
+    def __init__(self, build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True):
+        self.build, self.dataset, self.config = build, dataset, config
         self.view = main_view(dataset)
         self.index: Index = load_index(self.build, dataset, config, progress)
 
-    def read(self, episode: int, open_files: dict[int, RecordFile]) -> list[EncodedSample]:
-        """All samples of an episode."""
+    def parse(self, episode: int, open_files: dict[int, RecordFile]) -> RldsEpisode:
+        """The usable episode of that number as it is stored. open_files: by shard, a few; kept up to date."""
         shard, record = int(self.index.shard[episode]), int(self.index.record[episode])
         if shard not in open_files:
             while len(open_files) >= 4:
@@ -68,7 +68,11 @@ class OpenDataset:
             offsets = None if self.index.offsets is None else self.index.offsets[shard]
             open_files[shard] = self.build.open_shard(self.build.shards(self.config.split)[shard], offsets)
         where = f"{self.index.shards[shard]}, record {record}"
-        parsed = self.build.parse(open_files[shard].read(record), where)
+        return self.build.parse(open_files[shard].read(record), where)
+
+    def read(self, episode: int, open_files: dict[int, RecordFile]) -> list[EncodedSample]:
+        """All samples of an episode."""
+        parsed = self.parse(episode, open_files)
         motion = self.dataset.motion(parsed)
         return self._samples(parsed, motion.instruction, make_targets(motion, self.dataset, self.config))
 
@@ -140,8 +144,7 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
     def __init__(self, config: OxeConfig, seed: int, progress: bool = True):
         self.config, self.seed = config, seed
         self.datasets, self.weights = open_mixture(config, progress)
-        sizes = np.array([source.index.num_samples for source in self.datasets], float)
-        self.shares = self.weights * sizes / np.sum(self.weights * sizes)
+        self.shares = shares_of(self.datasets, self.weights)
         window = max(1, -(-config.window // config.streams))
         self._schedules = [schedule(self.shares, [seed, stream]) for stream in range(config.streams)]
         # The same for every stream.
@@ -200,12 +203,20 @@ def open_mixture(config: OxeConfig, progress: bool = True) -> tuple[list[OpenDat
     if len({get_dataset(name).frame for name in kept}) > 1 and config.target == "relative":
         tools = [name for name in kept if get_dataset(name).frame == "tool"]
         raise UserError(f"mixture: displacements of {', '.join(tools)} are in the tool's frame; train on them alone")
-    return [OpenDataset(get_dataset(name), config, progress) for name in kept], np.array(
-        [weights[name] for name in kept]
-    )
+    datasets = [get_dataset(name) for name in kept]
+    builds = [RldsBuild(folder_of(dataset, config)) for dataset in datasets]
+    opened = [OpenDataset(build, dataset, config, progress) for build, dataset in zip(builds, datasets, strict=True)]
+    return opened, np.array([weights[name] for name in kept])
 
 
-def _folder_of(dataset: OxeDataset, config: OxeConfig) -> str:
+def shares_of(datasets: Sequence[OpenDataset], weights: np.ndarray) -> np.ndarray:
+    """(D,): each dataset's share of the samples, its weight times its size, adding up to 1."""
+    sizes = weights * np.array([source.index.num_samples for source in datasets], float)
+    return sizes / sizes.sum()
+
+
+def folder_of(dataset: OxeDataset, config: OxeConfig) -> str:
+    """Where the dataset is, or the version of it that the registry is about. Raises UserError where it is not."""
     folder = files.join(config.folder, dataset.name)
     if not files.exists(folder):
         raise UserError(

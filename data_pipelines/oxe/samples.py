@@ -37,12 +37,8 @@ def make_batcher(
     numbers = number_rows(tokenizer, encoding.style)
 
     def text(frame: EncodedSample) -> Sample:
-        poses = np.stack([frame.pose, target_of(frame, encoding, scale)])
-        state, bins = np.asarray(encoding.codec.encode(poses, np.stack([frame.gripper_open, frame.target_gripper])))
-        prompt = format_prompt(frame.instruction, state, None, encoding.style)
-        tokens, mask, answer_mask = encode_text(
-            tokenizer, prompt, format_answer(bins, encoding.style), encoding.max_text_length
-        )
+        prompt, answer, bins = prompt_and_answer(frame, encoding, scale)
+        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
         rows = np.zeros(len(tokens), np.int32)
         rows[answer_mask] = numbers.rows(bins)
         return {"text_tokens": tokens, "text_mask": mask, "answer_mask": answer_mask, "number_rows": rows}
@@ -53,7 +49,7 @@ def make_batcher(
         for row, (number, frame) in enumerate(frames):
             try:
                 rng = np.random.default_rng([seed, number])
-                rows.append({**_picture(frame, rng, config, encoding.use_points, rgb[row]), **text(frame)})
+                rows.append({**write_picture(frame, rng, config, encoding.use_points, rgb[row]), **text(frame)})
             except DataError as error:
                 if not config.skip_bad:
                     raise
@@ -70,6 +66,16 @@ def make_batcher(
     return batch
 
 
+def prompt_and_answer(
+    frame: EncodedSample, encoding: EncodingConfig, scale: MixtureScale | None
+) -> tuple[str, str, np.ndarray]:
+    """The texts of a sample, and the answer's bins, integers (A, 8). scale: for relative targets."""
+    poses = np.stack([frame.pose, target_of(frame, encoding, scale)])
+    state, bins = np.asarray(encoding.codec.encode(poses, np.stack([frame.gripper_open, frame.target_gripper])))
+    prompt = format_prompt(frame.instruction, state, None, encoding.style)
+    return prompt, format_answer(bins, encoding.style), bins
+
+
 def target_of(frame: EncodedSample, encoding: EncodingConfig, scale: MixtureScale | None) -> np.ndarray:
     """(A, 7): the target pose, or the displacement as a pose inside the codec's box."""
     if frame.displacement is None:
@@ -79,7 +85,7 @@ def target_of(frame: EncodedSample, encoding: EncodingConfig, scale: MixtureScal
     return scale.scale.to_pose(scale.to_mixture(frame.dataset, frame.displacement), encoding.codec)
 
 
-def _picture(
+def write_picture(
     frame: EncodedSample, rng: np.random.Generator, config: OxeConfig, use_points: bool, rgb: np.ndarray
 ) -> Sample:
     """Writes `rgb` (S, S, 3); returns depth, intrinsics and world_from_camera, which a crop moves along."""

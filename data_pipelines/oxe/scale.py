@@ -1,9 +1,11 @@
 """The range that displacements are binned over: one for a whole mixture, so that a policy needs no dataset's name."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from data_pipelines.oxe.index import QUANTILES
-from data_pipelines.oxe.mixture import MixtureSource
+from data_pipelines.oxe.mixture import OpenDataset
 from dsvla_jax.encoding.displacement import DisplacementScale
 
 LOW, HIGH = round(0.01 * (QUANTILES - 1)), round(0.99 * (QUANTILES - 1))
@@ -17,17 +19,18 @@ class MixtureScale:
     is metric, the range is -1 to 1.
     """
 
-    def __init__(self, source: MixtureSource):
-        quantiles = [np.asarray(item.index.quantiles) for item in source.datasets]
-        metric = [item.dataset.metric for item in source.datasets]
+    def __init__(self, datasets: Sequence[OpenDataset], shares: np.ndarray):
+        """shares: (D,), of each dataset in the samples."""
+        quantiles = [np.asarray(item.index.quantiles) for item in datasets]
+        metric = [item.dataset.metric for item in datasets]
         low, high = -np.ones(6), np.ones(6)
         if any(metric):
-            known = [(rows, share) for rows, share, one in zip(quantiles, source.shares, metric, strict=True) if one]
+            known = [(rows, share) for rows, share, one in zip(quantiles, shares, metric, strict=True) if one]
             low, high = (np.array([_quantile(known, column, at) for column in range(6)]) for at in (0.01, 0.99))
         self.scale = DisplacementScale(tuple(map(float, low)), tuple(map(float, high)))
         self._own = {
             item.dataset.name: None if one else (rows[LOW], rows[HIGH])
-            for item, rows, one in zip(source.datasets, quantiles, metric, strict=True)
+            for item, rows, one in zip(datasets, quantiles, metric, strict=True)
         }
 
     def to_mixture(self, dataset: str, displacement: np.ndarray) -> np.ndarray:

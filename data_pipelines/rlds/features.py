@@ -83,7 +83,7 @@ class RldsEpisode:
     def column(self, path: str) -> np.ndarray:
         """A numeric feature: (T, *shape) of its own dtype for a step's, (*shape) for an episode's."""
         feature = self._feature(path)
-        if not _is_numeric(feature):
+        if not is_number(feature):
             raise DataError(self.where, path, "a numeric tensor", repr(feature), "ask for another feature")
         if not _is_simple(feature):
             raise DataError(
@@ -108,7 +108,7 @@ class RldsEpisode:
     def encoded(self, path: str) -> Sequence[bytes]:
         """The undecoded bytes of an image or string feature, one a step."""
         feature = self._feature(path)
-        if not (isinstance(feature, Image) or _is_text(feature)):
+        if not (isinstance(feature, Image) or is_text(feature)):
             raise DataError(self.where, path, "an image or a string", repr(feature), "ask for another feature")
         values = self._raw(path, feature)
         if path.startswith(f"{STEPS}/") and len(values) != self.num_steps:
@@ -183,12 +183,14 @@ def decode_image(data: bytes, kind: ImageFormat, where: object) -> np.ndarray:
     return picture
 
 
-def _is_text(feature: Any) -> bool:
+def is_text(feature: Any) -> bool:
+    """Whether a feature holds strings."""
     return _is_tensor(feature) and np.dtype(feature.np_dtype) == np.object_
 
 
-def _is_numeric(feature: Any) -> bool:
-    return _is_tensor(feature) and not _is_text(feature)
+def is_number(feature: Any) -> bool:
+    """Whether a feature is a tensor of numbers or truth values."""
+    return _is_tensor(feature) and not is_text(feature)
 
 
 def _is_tensor(feature: Any) -> bool:
@@ -201,7 +203,7 @@ def _values_a_step(feature: Any) -> int:
 
 def _is_bytes(feature: Any) -> bool:
     """Whether a value is stored as one string of bytes."""
-    return isinstance(feature, Image) or _is_text(feature) or feature._encoding != Encoding.NONE
+    return isinstance(feature, Image) or is_text(feature) or feature._encoding != Encoding.NONE
 
 
 def _is_simple(feature: Any) -> bool:
