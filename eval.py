@@ -35,6 +35,7 @@ from dsvla_jax.report import (
     write_results,
 )
 from dsvla_jax.rollout import Ending, run_episodes
+from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.shifts import check_shifts
@@ -56,6 +57,10 @@ class Options:
     """Unseen episodes a task; the config's number if not given."""
     batch: int = 100
     """Most episodes side by side."""
+    keypoints: Literal["oracle", "segmentation", "segmentation-refresh"] = "oracle"
+    """What the policy is told to go near: the task's own points as they are at the start (oracle); those found in the
+    first picture, by the simulator's masks and the depth on them (segmentation; paper, section 3.3); or those found in
+    the picture before every key pose, hidden objects where they were last seen (segmentation-refresh)."""
     keypoint_noise: float = 0.0
     """Metres of uniform noise an axis on every keypoint (paper, section 4.3: up to 0.1)."""
     shift: tuple[str, ...] = ()
@@ -86,6 +91,8 @@ def main(options: Options) -> None:
     results = kept
     if missing:
         policy = dsvla_jax.policy.load(options.run, decoding=Decoding(options.choice))
+        if options.keypoints != "oracle" and not policy.config.encoding.use_keypoints:
+            raise UserError(f"{options.run}: trained without keypoints; leave out --keypoints {options.keypoints}")
         for name in missing:
             endings = evaluate_task(policy, experiment, name, episodes, options)
             save_strips(file, name, endings)
@@ -107,11 +114,12 @@ def main(options: Options) -> None:
 
 def results_file(run: Path, options: Options) -> Path:
     """Where the results of these conditions are kept; the physics alone name the plain ones."""
+    keypoints = f"-{options.keypoints}" if options.keypoints != "oracle" else ""
     noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
     shifts = "".join(f"-{name}" for name in check_shifts(options.shift))
     choice = f"-{options.choice}" if options.choice != "greedy" else ""
     seed = f"-seed-{options.seed}" if options.seed else ""
-    return run / "eval" / f"{options.physics}{noise}{shifts}{choice}{seed}.jsonl"
+    return run / "eval" / f"{options.physics}{keypoints}{noise}{shifts}{choice}{seed}.jsonl"
 
 
 def other_physics(physics: str) -> str:
@@ -142,13 +150,18 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
             told = first_use(f"{name} {options.physics} x {size}", bar.set_postfix_str)
             with told if start == 0 else contextlib.nullcontext():
                 state = environment.reset(keys)
-                keypoints = environment.keypoints(state)
-            noise = np.random.default_rng([options.seed, start]).uniform(-1, 1, keypoints.shape)
+                own = environment.keypoints(state)
+            noise = np.random.default_rng([options.seed, start]).uniform(-1, 1, own.shape)
+            found = None
+            if options.keypoints != "oracle":
+                refresh = options.keypoints == "segmentation-refresh"
+                found = SegmentationKeypoints(environment, state, refresh)
             endings += run_episodes(
                 environment,
                 policy.act,
                 state,
                 noise=noise * options.keypoint_noise,
+                find_keypoints=found,
                 on_keyframe=lambda done, succeeded: bar.set_postfix_str(
                     f"key pose {done}, {succeeded}/{size} succeeded"
                 ),

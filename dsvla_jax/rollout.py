@@ -15,6 +15,8 @@ from dsvla_jax.sim.physics import SimState
 from dsvla_jax.types import Action, Camera, Observation
 
 Act = Callable[[Observation, Sequence[str], np.ndarray], tuple[Action, Sequence[str]]]
+# State and what is seen of it -> keypoints (B, A, K, 3), and why an episode has none, empty where it has.
+KeypointSource = Callable[[SimState, Observation], tuple[np.ndarray, Sequence[str]]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,18 +44,23 @@ def run_episodes(
     state: SimState,
     limit: int | None = None,
     noise: np.ndarray | float = 0.0,
+    find_keypoints: KeypointSource | None = None,
     on_keyframe: Callable[[int, int], None] = lambda done, succeeded: None,
 ) -> list[Ending]:
     """Runs the episodes of a reset state to their ends, side by side.
 
     limit: key poses after which an episode is over; twice the expert's if not given.
-    noise: metres added to the keypoints, (B, A, K, 3) or a number.
+    noise: metres added to the keypoints, (B, A, K, 3) for the task's K or a number.
+    find_keypoints: asked before every key pose; the task's own keypoints at the start if not given. An episode for
+        which it has none is over.
     on_keyframe: told the number of key poses done and of successes so far.
     """
     batch = state.qpos.shape[0]
     instructions = environment.instructions(state, np.arange(batch))
-    keypoints = (np.asarray(environment.keypoints(state)) + noise).astype(np.float32)
-    latched = np.zeros(keypoints.shape[:2], np.int32)
+    own, no_problem = np.asarray(environment.keypoints(state)), [""] * batch
+    noise = np.broadcast_to(noise, own.shape)
+    latched = np.zeros(own.shape[:2], np.int32)
+    problems = no_problem
     seen: list[list[np.ndarray]] = [[] for _ in range(batch)]
     answers: list[list[str]] = [[] for _ in range(batch)]
     targets: list[list[np.ndarray]] = [[] for _ in range(batch)]
@@ -62,6 +69,10 @@ def run_episodes(
         if over.all():
             break
         observation = environment.observe(state)
+        keypoints, missing = find_keypoints(state, observation) if find_keypoints else (own, no_problem)
+        keypoints = (keypoints + noise[:, :, : keypoints.shape[2]]).astype(np.float32)
+        problems = [old or new for old, new in zip(problems, missing, strict=True)]
+        over |= np.array([bool(problem) for problem in problems])
         latched = np.asarray(jax.vmap(advance_latch)(latched, observation.pose[..., :3], keypoints))
         active = np.asarray(jax.vmap(jax.vmap(active_keypoint))(latched, keypoints))
         action, texts = act(observation, instructions, active)
@@ -71,9 +82,10 @@ def run_episodes(
             answers[i].append(texts[i])
             targets[i].append(positions[i])
         state = environment.execute(state, action)
-        over = has_ended(state)
+        over |= has_ended(state)
         on_keyframe(done, int(np.sum(environment.success(state))))
     last, reasons = np.asarray(environment.observe(state).rgb), failure_reasons(environment, state)
+    reasons = [problem or reason for problem, reason in zip(problems, reasons, strict=True)]
     return [
         Ending(
             success=not reasons[i],

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dsvla_jax.rollout import run_episodes
+from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
@@ -90,6 +91,42 @@ def test_episodes_end_alike_in_mjx(task, shifts):
     np.testing.assert_allclose(ends["mujoco", "start"], ends["mjx", "start"], atol=1e-3)
     assert [end.success for end in ends["mujoco"]] == [end.success for end in ends["mjx"]]
     assert sum(end.success for end in ends["mjx"]) >= EPISODES - 1
+
+
+def test_keypoints_of_the_segmentation_are_the_first_frames_or_refreshed():
+    """The rubbish is carried to the bin: what was found first stays, what is looked for again goes with it."""
+    env = Environment("put_rubbish_in_bin", image_size=96)
+    start = env.reset(keys_of("put_rubbish_in_bin"))
+    states = env.follow(start, env.expert(start))
+    first, refreshed = (SegmentationKeypoints(env, start, refresh) for refresh in (False, True))
+    found = [(first(state, env.observe(state)), refreshed(state, env.observe(state))) for state in states]
+    for (kept, missing), _ in found:
+        assert missing == [""] * EPISODES
+        np.testing.assert_array_equal(kept, found[0][0][0])
+        # The middle of the rubbish, 2 cm under its top, and that of the bin's opening, not of the bin's side.
+        assert np.linalg.norm(kept - env.keypoints(start), axis=-1)[..., 0].max() < 0.03
+    carried = found[3][1][0][:, 0, 0]
+    assert np.linalg.norm(carried - env.keypoints(states[3])[:, 0, 0], axis=-1).max() < 0.04
+    assert np.linalg.norm(carried - found[0][0][0][:, 0, 0], axis=-1).min() > 0.1
+
+
+def test_an_episode_whose_object_is_not_seen_is_over_and_says_so():
+    env = Environment("lamp_on", image_size=96)
+    start, told = env.reset(keys_of("lamp_on")), []
+    places = np.array(start.geom_xpos)
+    places[1, env.scene.mj_model.geom("lamp_button").id] -= 5.0
+    hidden = start.replace(geom_xpos=places)
+
+    def act(observation, instructions, keypoints):
+        told.append(keypoints)
+        return Action(observation.pose, observation.gripper_open), ["stay"] * EPISODES
+
+    endings = run_episodes(env, act, hidden, limit=2, find_keypoints=SegmentationKeypoints(env, hidden))
+    reason = "keypoints not found: 'little green light switch': its mask is empty"
+    assert [ending.reason for ending in endings] == ["time-out", reason, "time-out", "time-out"]
+    assert [ending.keyframes for ending in endings] == [2, 0, 2, 2]
+    seen = np.arange(EPISODES) != 1
+    assert np.linalg.norm(told[1] - env.keypoints(start)[:, :, 0], axis=-1)[seen].max() < 0.03
 
 
 def test_noise_moves_the_keypoints_that_the_policy_is_told():

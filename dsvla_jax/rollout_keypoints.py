@@ -1,0 +1,52 @@
+"""Keypoints of simulated episodes as perception finds them in the pictures, with a perfect detector.
+
+The paper finds them so (section 3.3), with Grounding DINO and SAM in the place of the simulator's segmentation.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from dsvla_jax.perception.keypoints import KeypointsNotFound, KeypointTracker, Sighting
+from dsvla_jax.perception.phrases import phrases_for
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.objects import object_masks
+from dsvla_jax.sim.physics import SimState
+from dsvla_jax.types import Observation
+
+
+class SegmentationKeypoints:
+    """A `rollout.KeypointSource` for one batch of episodes: the simulator's masks of the task's objects and the depth
+    seen on them, through the geometry that a robot's pictures go through.
+
+    state: the reset state of the B episodes. refresh: looks again before every key pose, see `KeypointTracker`;
+    otherwise the first frame's keypoints are kept. Raises UserError for a task whose instructions have no phrases.
+    """
+
+    def __init__(self, environment: Environment, state: SimState, refresh: bool = False):
+        self._environment = environment
+        self._arms = [phrases_for(instruction) for instruction in environment.instructions(state)]
+        self._trackers = [KeypointTracker(functools.partial(self._segment, i), refresh) for i in range(len(self._arms))]
+        self._refresh, self._masks = refresh, np.zeros(0, bool)
+
+    def __call__(self, state: SimState, observation: Observation) -> tuple[np.ndarray, list[str]]:
+        """float32 (B, A, K, 3), and for each episode why it has none; the keypoints of such a one are zeros."""
+        if self._refresh or not self._masks.size:
+            self._masks = object_masks(self._environment, state)
+        rgb, depth = np.asarray(observation.rgb), np.asarray(observation.depth)
+        most = max(len(arm) for arm in self._arms[0])
+        points = np.zeros((len(rgb), self._environment.num_arms, most, 3), np.float32)
+        problems = [""] * len(rgb)
+        for i, (tracker, arms) in enumerate(zip(self._trackers, self._arms, strict=True)):
+            try:
+                camera = jax.tree.map(lambda x, i=i: x[i], observation.camera)
+                points[i] = tracker.keypoints(rgb[i], depth[i], camera, arms)
+            except KeypointsNotFound as problem:
+                problems[i] = str(problem)
+        return points, problems
+
+    def _segment(self, i: int, rgb: np.ndarray, phrases: Sequence[str]) -> list[Sighting]:
+        masks = {phrase: mask for arm in self._arms[i] for phrase, mask in zip(arm, self._masks[i], strict=True)}
+        return [Sighting(phrase, masks[phrase]) for phrase in phrases]
