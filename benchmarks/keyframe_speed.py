@@ -37,10 +37,10 @@ class Options:
     """Empty: only C MuJoCo."""
 
 
-def fastest(*functions: Callable[[], Any]) -> list[float]:
+def fastest(*functions: Callable[[], Any], repeats: int = REPEATS) -> list[float]:
     """Seconds of the fastest call of each function, after a first; called by turns, so that they see one load."""
     times = [[] for _ in functions]
-    for _ in range(1 + REPEATS):
+    for _ in range(1 + repeats):
         for function, taken in zip(functions, times, strict=True):
             start = time.perf_counter()
             jax.block_until_ready(function())
@@ -84,7 +84,7 @@ def mjx_throughput(name: str, batches: tuple[int, ...]) -> None:
         jax.block_until_ready(state)
         compiled = time.perf_counter() - start
         action = jax.tree.map(jnp.asarray, first_action(environment, state))
-        (seconds,) = fastest(lambda state=state, action=action: environment.execute(state, action))
+        (seconds,) = fastest(lambda state=state, action=action: environment.execute(state, action), repeats=2)
         rate = batch * KEYFRAME_STEPS / seconds
         print(f"{name} in MJX, batch {batch:4}: {rate:8.0f} steps/s, first call {compiled:.0f} s", flush=True)
 
