@@ -1,9 +1,11 @@
-"""The Open X-Embodiment loader against tf.data on one 256-pixel dataset: frames/s, memory, growth (three minutes).
+"""The loaders: frames/s and memory against tf.data, flat memory over 20 passes, statistics in time (three minutes).
 
-Needs the `tensorflow` extra. Both crop, vary colours, resize to 224 and batch; each runs in a process of its own on
-the same cores, by turns. tf.data reads as octo does: parse with skipped decoding, flatten to frames, shuffle encoded
-frames, decode in a parallel map. Our loader also writes prompts and answers. Asked for: 1.5 times the frames/s, half
-the peak resident memory, no growth over 20 passes, and the statistics of 1,000 episodes of 50 steps in 10 seconds.
+Needs the `tensorflow` extra, here or in another environment (``--peer-python /path/to/python``); ``--no-peer`` leaves
+the comparison out. On one 256-pixel dataset both crop, vary colours, resize to 224 and batch; each runs in a process of
+its own on the same cores, by turns. tf.data reads as octo does: parse with skipped decoding, flatten to frames, shuffle
+encoded frames, decode in a parallel map. Our loader also writes prompts and answers. Asked for: 1.5 times the frames/s,
+half the peak resident memory, no growth over 20 passes, of the demonstrations' loader too, and the statistics of 1,000
+episodes of 50 steps (100 different ones, ten times over) in 10 seconds.
 
     python -m benchmarks.loader_speed [--episodes 60]
 """
@@ -68,7 +70,55 @@ def ours(folder: Path, frames: int, passes: int = 1) -> dict:
     config = OxeConfig(folder=str(folder), mixture=(NAME,), image_size=SIZE, crop=CROP, streams=1)
     encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64, use_points=False)
     loader = OxeLoader(config, encoding, suite_tokenizer(), batch_size=BATCH, seed=0, progress=False)
-    return measure(iter(loader), frames, passes, lambda batch: batch["rgb"].shape)
+    return measure(iter(loader), frames, passes)
+
+
+def demonstrations(folder: Path, frames: int, passes: int = 1) -> dict:
+    """The same of the loader of demonstrations, with every variation that a config can ask for."""
+    from data_pipelines.episodes import EpisodeReader
+    from data_pipelines.loader import make_loader
+    from data_pipelines.samples import make_sampler, suite_tokenizer
+    from dsvla_jax.data_config import DataConfig
+    from dsvla_jax.encoding.encode import EncodingConfig
+
+    data = DataConfig(shift_world=0.05, crop=CROP, state_jitter=0.01, colour_variation=0.2)
+    encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64)
+    sample = make_sampler(data, encoding, suite_tokenizer())
+    return measure(make_loader(EpisodeReader(folder), sample, batch_size=BATCH, seed=0), frames, passes)
+
+
+def write_demonstrations(folder: Path, episodes: int, frames: int) -> None:
+    """Demonstrations of one arm with pictures of noise."""
+    from data_pipelines.episodes import write_episodes
+    from data_pipelines.records import make_episode
+
+    rng = np.random.default_rng(0)
+
+    def episode(number: int):
+        pose = np.concatenate(
+            [rng.uniform(-0.3, 0.3, (frames, 1, 3)) + np.array([0, 0, 1]), np.zeros((frames, 1, 4))], axis=2
+        )
+        pose[..., 4] = 1.0
+        camera = np.eye(4)
+        camera[:3, :3], camera[:3, 3] = np.diag([1, -1, -1]), (0, 0, 2)
+        return make_episode(
+            task="lamp_on",
+            instruction="turn on the light",
+            seed=number,
+            rgb=rng.integers(0, 256, (frames, SIZE, SIZE, 3), np.uint8),
+            depth=rng.uniform(0.5, 1.5, (frames, SIZE, SIZE)),
+            intrinsics=[[SIZE, 0, SIZE / 2], [0, SIZE, SIZE / 2], [0, 0, 1]],
+            world_from_camera=camera,
+            pose=pose,
+            gripper_open=np.ones((frames, 1)),
+            target_pose=pose,
+            target_gripper=np.zeros((frames, 1)),
+            keypoints=pose[:1, :, :3].swapaxes(0, 1),
+            active_keypoint=pose[..., :3],
+        )
+
+    folder.mkdir()
+    write_episodes(folder, map(episode, range(episodes)))
 
 
 def tf_data(folder: Path, frames: int, passes: int = 1) -> dict:
@@ -96,15 +146,15 @@ def tf_data(folder: Path, frames: int, passes: int = 1) -> dict:
 
     stream = episodes.repeat().flat_map(lambda episode: episode["steps"]).shuffle(2000)
     stream = stream.map(picture, num_parallel_calls=tf.data.AUTOTUNE).batch(BATCH).prefetch(tf.data.AUTOTUNE)
-    return measure(stream.as_numpy_iterator(), frames, passes, lambda batch: batch["rgb"].shape)
+    return measure(stream.as_numpy_iterator(), frames, passes)
 
 
-def measure(batches, frames: int, passes: int, shape) -> dict:
+def measure(batches, frames: int, passes: int) -> dict:
     """Frames/s over each of `passes` times `frames`, after a first batch, and the resident memory after each.
 
     work: milliseconds of processor time a frame, which says more than the clock where others use the machine.
     """
-    assert shape(next(batches)) == (BATCH, SIZE, SIZE, 3)
+    assert next(batches)["rgb"].shape == (BATCH, SIZE, SIZE, 3)
     speeds, memory = [], []
     worked = time.process_time()
     for _ in range(passes):
@@ -118,7 +168,7 @@ def measure(batches, frames: int, passes: int, shape) -> dict:
     return {"speed": float(np.median(speeds)), "work": 1e3 * work, "peak": peak, "memory": memory}
 
 
-def statistics(folder: Path) -> dict:
+def statistics(folder: Path, *_: int) -> dict:
     """Seconds for the index and statistics of the whole build: by the clock, and of processor time.
 
     One thread does it all, so that processor time is the clock's on a machine that nobody else uses.
@@ -135,46 +185,61 @@ def statistics(folder: Path) -> dict:
     return {"seconds": took, "work": worked, "episodes": len(index.samples), "samples": index.num_samples}
 
 
-def in_process(what: str, folder: Path, frames: int, passes: int = 1) -> dict:
+def in_process(what: str, folder: Path, frames: int, passes: int = 1, python: str = sys.executable) -> dict:
     """Runs one measurement in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.loader_speed", "--only", what, str(folder), str(frames), str(passes)]
+    command = [python, "-m", "benchmarks.loader_speed", "--only", what, str(folder), str(frames), str(passes)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{what} failed:\n{done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def compare(folder: Path, frames: int, peer_python: str) -> dict[str, tuple[float, float, str]]:
+    """Prints what both loaders do by turns, and returns the ratios with what is asked of them."""
+    rounds = [
+        (in_process("ours", folder, frames), in_process("tf_data", folder, frames, python=peer_python))
+        for _ in range(3)
+    ]
+    ratios = [mine["speed"] / peer["speed"] for mine, peer in rounds]
+    mine, peer = (
+        {key: float(np.median([one[i][key] for one in rounds])) for key in ("speed", "work", "peak")} for i in (0, 1)
+    )
+    for name, one in (("ours", mine), ("tf.data", peer)):
+        figures = f"{one['work']:.2f} ms of processor time a frame, peak {one['peak']:.0f} MB"
+        print(f"{name}: {one['speed']:.0f} frames/s, {figures}")
+    print(f"speed ratio of each round: {', '.join(f'{ratio:.2f}' for ratio in ratios)}")
+    return {
+        "speed": (float(np.median(ratios)), SPEED, "at least"),
+        "peak memory": (mine["peak"] / peer["peak"], MEMORY, "at most"),
+    }
+
+
 def main() -> int:
     """Prints the figures; 0 where all that is asked for holds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--peer-python", default=sys.executable, help="of an environment with TensorFlow")
+    parser.add_argument("--no-peer", action="store_true", help="only what needs no TensorFlow")
     parser.add_argument("--only", nargs=4, metavar=("WHAT", "FOLDER", "FRAMES", "PASSES"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.only:
         what, folder, frames, passes = options.only
-        if what == "statistics":
-            print(json.dumps(statistics(Path(folder))))
-        else:
-            print(json.dumps({"ours": ours, "tf_data": tf_data}[what](Path(folder), int(frames), int(passes))))
+        measured = {"ours": ours, "tf_data": tf_data, "demonstrations": demonstrations, "statistics": statistics}[what]
+        print(json.dumps(measured(Path(folder), int(frames), int(passes))))
         return 0
     results = {}
     with tempfile.TemporaryDirectory() as temporary:
-        small, large = Path(temporary) / "small", Path(temporary) / "large"
+        small, large, demos = (Path(temporary) / name for name in ("small", "large", "demos"))
         write_data(small, options.episodes)
         frames = options.episodes * (STEPS - 1)
-        rounds = [(in_process("ours", small, frames), in_process("tf_data", small, frames)) for _ in range(3)]
-        ratios = [mine["speed"] / peer["speed"] for mine, peer in rounds]
-        mine, peer = (
-            {key: np.median([one[i][key] for one in rounds]) for key in ("speed", "work", "peak")} for i in (0, 1)
-        )
-        for name, one in (("ours", mine), ("tf.data", peer)):
-            figures = f"{one['work']:.2f} ms of processor time a frame, peak {one['peak']:.0f} MB"
-            print(f"{name}: {one['speed']:.0f} frames/s, {figures}")
-        results["speed"] = (float(np.median(ratios)), SPEED, "at least")
-        results["peak memory"] = (float(mine["peak"] / peer["peak"]), MEMORY, "at most")
-        print(f"speed ratio of each round: {', '.join(f'{ratio:.2f}' for ratio in ratios)}")
-        memory = in_process("ours", small, frames, 20)["memory"]
-        results["memory of pass 20 to pass 5"] = (memory[19] / memory[4], GROWTH, "at most")
+        if not options.no_peer:
+            results |= compare(small, frames, options.peer_python)
+        write_demonstrations(demos, 20, 6)
+        for what, folder, count in (("ours", small, frames), ("demonstrations", demos, 120)):
+            memory = in_process(what, folder, count, 20)["memory"]
+            print(f"{what}: resident memory after passes 1, 5, 10, 15, 20:", end=" ")
+            print(", ".join(f"{memory[number - 1]:.0f}" for number in (1, 5, 10, 15, 20)), "MB")
+            results[f"memory of pass 20 to pass 5, {what}"] = (memory[19] / memory[4], GROWTH, "at most")
         write_data(large, 100, copies=10)
         told = in_process("statistics", large, 0)
         print(f"statistics of {told['episodes']} episodes, {told['samples']} samples: {told['seconds']:.1f} s", end=" ")

@@ -19,7 +19,6 @@ from data_pipelines.oxe.targets import key_frames, make_targets
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
 from data_pipelines.records import DataError
 from data_pipelines.rlds.build import RldsBuild
-from data_pipelines.rlds.tfrecord import write_records
 from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
@@ -115,6 +114,27 @@ def test_an_epoch_of_one_dataset_is_every_frame_once(folder):
     epochs = [[source[epoch * expected + i].where for i in range(expected)] for epoch in range(2)]
     assert len(set(epochs[0])) == len(set(epochs[1])) == expected
     assert epochs[0] != epochs[1]
+
+
+def test_an_epoch_of_every_dataset_of_a_mixture_is_every_frame_once(folder):
+    """Of each stream of each dataset, whichever process reads which numbers."""
+    config = config_for(folder)
+    sources = [MixtureSource(config, seed=3, progress=False) for _ in range(3)]
+    drawn: dict[tuple[str, int], list[str]] = {}
+    for number in range(3000):
+        sample = sources[number % 3][number]
+        drawn.setdefault((sample.dataset, number % config.streams), []).append(sample.where)
+    for name in names_of(FIVE):
+        everything: list[str] = []
+        for stream in range(config.streams):
+            told = drawn[name, stream]
+            size = len(set(told))
+            epochs = [told[start : start + size] for start in range(0, len(told) - size + 1, size)]
+            assert len(epochs) >= 2
+            assert all(sorted(epoch) == sorted(set(told)) for epoch in epochs)
+            everything += set(told)
+        assert len(everything) == len(set(everything))
+        assert len(everything) == sum(episode.num_steps - 1 for episode in known_episodes(name, 9, 9))
 
 
 def test_processes_share_out_the_one_stream(folder):
@@ -336,47 +356,6 @@ def test_light_varies_colours_and_nothing_else():
     assert varied.shape == picture.shape
     assert np.abs(varied.astype(int) - picture).mean() > 2
     np.testing.assert_array_equal(varied, vary_light(picture, np.random.default_rng(1), 0.3))
-
-
-def damaged(tmp_path, name="cmu_stretch"):
-    write_fixture(tmp_path, name, episodes=6, steps=6)
-    first, second = sorted((tmp_path / name / "0.1.0").glob("*.tfrecord-*"))
-    return first, second
-
-
-def test_damage_stops_or_is_listed(tmp_path):
-    first, second = damaged(tmp_path)
-    data = bytearray(first.read_bytes())
-    data[500] ^= 255
-    first.write_bytes(data)
-    second.write_bytes(second.read_bytes()[:-9])
-    config = config_for(tmp_path, ("cmu_stretch",), streams=1)
-    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
-    with pytest.raises(DataError, match="00000-of-00002, record 0: CRC of the record"):
-        load_index(build, dataset, config, progress=False)
-    index = load_index(build, dataset, dataclasses.replace(config, skip_bad=True), progress=False)
-    assert len(index.samples) == 4
-    assert [where.rpartition("-")[2] for where, _ in index.left_out] == ["00002, record 0", "00002"]
-    assert index.left_out[1][1].startswith("records: expected 3 and no bytes after them, got 2 whole ones")
-
-
-def test_pictures_that_cannot_be_decoded_stop_or_are_left_out(tmp_path, capsys):
-    first, _ = damaged(tmp_path)
-    records = RldsBuild(tmp_path / "cmu_stretch")
-    shard = records.open_shard(records.shards("train")[0])
-    contents = [shard.read(i) for i in range(len(shard))]
-    place = contents[1].index(b"\xff\xd8\xff")
-    contents[1] = contents[1][:place] + bytes(20) + contents[1][place + 20 :]
-    write_records(first, contents)
-    count = sum(episode.num_steps - 1 for episode in known_episodes("cmu_stretch", 6, 6))
-    with pytest.raises(DataError, match=r"record 1, step \d, steps/observation/image: image: expected a JPEG or PNG"):
-        for _ in zip(range(count), make(tmp_path, ("cmu_stretch",), streams=1, batch_size=1, threads=0), strict=False):
-            pass
-    loader = make(tmp_path, ("cmu_stretch",), streams=1, batch_size=1, threads=0, skip_bad=True)
-    for _ in range(2 * (count - 1)):
-        next(loader)
-    assert len(loader.left_out) == 1
-    assert capsys.readouterr().err.count("left out (1): ") == 1
 
 
 def test_statistics_are_kept_until_the_data_change(tmp_path, monkeypatch):

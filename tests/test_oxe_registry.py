@@ -146,7 +146,7 @@ def test_not_finite_and_empty_episodes_are_refused(tmp_path):
         steps[2]["action"]["world_vector"] = np.array([0, np.nan, 0], np.float32)
 
     episode = rewritten(tmp_path, "toto", spoil)
-    message = "00000-of-00001, record 0: action: expected finite numbers, got 1 NaN or infinite, the first at step 2"
+    message = "record 0: steps/action/world_vector: expected finite numbers, got 1 NaN or infinite, the first at step 2"
     with pytest.raises(DataError, match=message):
         get_dataset("toto").motion(episode)
     episode = rewritten(tmp_path, "viola", lambda steps: steps.clear())

@@ -74,7 +74,7 @@ def test_the_documented_sequence(tmp_path: Path):
         gripper_open=jnp.ones((1, 1)),
     )
     bare = Policy(dataclasses.replace(policy.config, displacement=None), policy.variables, policy.tokenizer)
-    told, answered = (one.act(observation, ["lift the ball"], None).action for one in (policy, bare))
+    told, answered = (one.decide(observation, ["lift the ball"], None).action for one in (policy, bare))
     np.testing.assert_allclose(told.pose, displace(pose, scale.from_pose(answered.pose, policy.codec)), atol=1e-6)
     assert np.all(np.abs(np.asarray(told.pose)[..., :3] - pose[..., :3]) < 0.5)
 

@@ -14,7 +14,7 @@ import pytest
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.keyframes import discover_keyframes, sample_starts
 from data_pipelines.records import DataError, decode_frame
-from data_pipelines.rlbench.__main__ import Settings, contact_keypoints, import_demonstrations
+from data_pipelines.rlbench.__main__ import Options, Settings, contact_keypoints, import_demonstrations, main
 from data_pipelines.rlbench.files import find_episodes, read_recording, unpack_depth
 from data_pipelines.rlbench.unpickle import read_pickle, to_array
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
@@ -338,6 +338,14 @@ WRITTEN_WRONG = {
         set_value(3, gripper_pose=np.zeros(6)),
         r"observation 3: gripper_pose: expected numbers \(7,\), got \(6,\)",
     ),
+    "words for numbers": (
+        set_value(3, gripper_pose=np.array(["a"] * 7)),
+        "low_dim_obs.pkl: observation 3: gripper_pose: expected numbers",
+    ),
+    "no camera": (
+        lambda i, felt, rest: rest["misc"].pop("front_camera_near"),
+        "low_dim_obs.pkl: observation 0: front_camera_near: expected to be recorded, got nothing",
+    ),
     "zero quaternion": (
         set_value(3, gripper_pose=np.zeros(7)),
         "episode0, observation 3: pose: expected a unit quaternion",
@@ -365,6 +373,10 @@ DAMAGED = {
     "foreign class": (
         rewrite("low_dim_obs.pkl", io.BytesIO()),
         r"low_dim_obs.pkl: pickle: expected only .*_io.BytesIO",
+    ),
+    "reduce payload": (
+        lambda folder: (folder / "low_dim_obs.pkl").write_bytes(pickle.dumps(Loud(folder / "made"))),
+        r"low_dim_obs.pkl: pickle: expected only .*mkdir.*nothing in it was run",
     ),
     "no pickle": (lambda folder: (folder / "low_dim_obs.pkl").unlink(), "low_dim_obs.pkl: file: .*No such file"),
     "no demo": (rewrite("low_dim_obs.pkl", 3), "low_dim_obs.pkl: pickle: expected a Demo"),
@@ -413,6 +425,26 @@ def test_damaged_episodes_are_named_and_skipped_only_on_request(tmp_path, name):
     reader = EpisodeReader(out)
     assert len(reader) == 1
     assert reader.episode(0).seed == 1
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_an_episode_without_steps_is_named(tmp_path, count):
+    episodes = tmp_path / "source" / "lamp_on" / "all_variations" / "episodes"
+    files.write_episode(episodes / "episode0", frames=4, size=16, demo_change=lambda observations: observations[:count])
+    with pytest.raises(DataError, match=rf"episode0/low_dim_obs.pkl: observations: expected at least 2, got {count}"):
+        import_demonstrations(tmp_path / "source", tmp_path / "out", Settings(), progress=False)
+
+
+def test_what_is_left_out_is_counted_and_listed(tmp_path, capsys):
+    source = files.write_dataset(tmp_path / "source", ["lamp_on"], episodes=3, frames=12, size=16)
+    for number in (0, 2):
+        (source / f"lamp_on/all_variations/episodes/episode{number}/front_rgb/5.png").unlink()
+    main(Options(source=source, out=tmp_path / "out", skip_bad=True))
+    printed = capsys.readouterr().out
+    assert "1 episodes (lamp_on 1)" in printed
+    assert "left out 2 damaged episodes:" in printed
+    for number in (0, 2):
+        assert f"episode{number}/front_rgb/5.png: file: expected a picture of each of 12" in printed
 
 
 def test_import_goes_on_where_it_stopped(source, tmp_path):

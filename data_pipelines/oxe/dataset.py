@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from data_pipelines.oxe.motion import Arm, Column, Motion
+from data_pipelines.oxe.motion import Arm, Column, Motion, require_finite
 from data_pipelines.records import DataError
 from data_pipelines.rlds.features import RldsEpisode
 
@@ -103,8 +103,5 @@ def _columns(episode: RldsEpisode, columns: list[Column | None], name: str) -> n
     if len(present) < len(columns):
         return None
     values = np.stack([column(episode) for column in present], axis=1).astype(np.float32)
-    if not np.all(np.isfinite(values)):
-        step = int(np.argwhere(~np.isfinite(values))[0, 0])
-        got = f"{int(np.sum(~np.isfinite(values)))} NaN or infinite, the first at step {step}"
-        raise DataError(episode.where, name, "finite numbers", got, "leave the episode out with --skip-bad")
+    require_finite(values, episode.where, name)
     return values

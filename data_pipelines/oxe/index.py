@@ -85,7 +85,7 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
             records = build.open_shard(shard)
             usable = len(records)
         except DataError as error:
-            _leave_out(error, shard.path, left_out, config)
+            _leave_out(error, f"{shard.path} (all {shard.records} records)", left_out, config)
             offsets.append(np.zeros(1, np.int64))
             continue
         if isinstance(records, TFRecordFile):

@@ -67,13 +67,25 @@ class Arm:
 
 
 def read(path: str, start: int | None = None, stop: int | None = None) -> Column:
-    """Columns start to stop of a feature of the steps, float64 (T, n)."""
+    """Columns start to stop of a feature of the steps, float64 (T, n). Raises DataError where one is not finite."""
 
     def column(episode: RldsEpisode) -> np.ndarray:
         values = episode.column(f"steps/{path}").astype(np.float64)
-        return values.reshape(len(values), -1)[:, start:stop]
+        values = values.reshape(len(values), -1)[:, start:stop]
+        # Here and not at the end: what is made of a column may not show that a number was missing.
+        require_finite(values, episode.where, f"steps/{path}")
+        return values
 
     return column
+
+
+def require_finite(values: np.ndarray, where: str, name: str) -> None:
+    """Raises DataError naming the first step of values (T, ...) that has a NaN or an infinity."""
+    if np.all(np.isfinite(values)):
+        return
+    step = int(np.argwhere(~np.isfinite(values))[0, 0])
+    got = f"{int(np.sum(~np.isfinite(values)))} NaN or infinite, the first at step {step}"
+    raise DataError(where, name, "finite numbers", got, "leave the episode out with --skip-bad")
 
 
 def join(*columns: Column) -> Column:

@@ -26,6 +26,8 @@ from tensorflow_datasets.proto import tf_example_pb2
 from data_pipelines.records import DataError
 
 STEPS = "steps"
+# Bytes within which a picture's end marker has to be: some writers pad.
+_TAIL = 64
 _FIX = "is features.json that of these records? Or leave bad records out with --skip-bad"
 
 
@@ -168,7 +170,9 @@ def decode_image(data: bytes, kind: ImageFormat, where: object) -> np.ndarray:
     """
     colour = kind.shape[-1] == 3 and kind.dtype == np.uint8
     flag = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if colour else cv2.IMREAD_UNCHANGED
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flag) if data else None
+    if not _is_whole(data):
+        raise DataError(where, "image", "a whole JPEG or PNG", f"{len(data)} bytes without its end", _FIX)
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
     if picture is None:
         raise DataError(where, "image", "a JPEG or PNG", f"{len(data)} undecodable bytes", _FIX)
     if not colour:
@@ -181,6 +185,11 @@ def decode_image(data: bytes, kind: ImageFormat, where: object) -> np.ndarray:
     if picture.dtype != kind.dtype or not fits:
         raise DataError(where, "image", f"{kind.dtype} {kind.shape}", f"{picture.dtype} {picture.shape}", _FIX)
     return picture
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether an encoded picture has its end: the decoder fills what is missing with one colour, and says nothing."""
+    return b"\xff\xd9" in data[-_TAIL:] or b"IEND" in data[-_TAIL:]
 
 
 def is_text(feature: Any) -> bool:
