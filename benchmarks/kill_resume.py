@@ -33,7 +33,14 @@ tiny --log-every 1 --checkpoint-every {CHECKPOINT_EVERY} --batch-size 4 --data.t
 --model.language.kv-heads 2 --model.language.ffn 64 --model.scan-unroll 1
 """.split()
 # What depends on the machine and not on the training.
-TIMINGS = ("seconds_per_step", "examples_per_second", "tokens_per_second", "data_wait_share", "host_memory_gib")
+TIMINGS = (
+    "seconds_per_step",
+    "examples_per_second",
+    "tokens_per_second",
+    "data_wait_share",
+    "model_tflops_per_second",
+    "host_memory_gib",
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,10 +1,12 @@
 """The planner: what it reads from compiled programs, what it counts by hand, and what it says about bad input."""
 
 import dataclasses
+import importlib.util
 import math
 import subprocess
 import sys
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -14,8 +16,9 @@ import pytest
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.vla import VLA
-from dsvla_jax.training.chips import CHIPS, find_slice
-from dsvla_jax.training.flops import training_flops
+from dsvla_jax.training.chips import CHIPS, find_slice, peak_flops
+from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.flops import model_flops, training_flops
 from dsvla_jax.training.hlo import program_cost
 from dsvla_jax.training.plan import parse_mesh
 from dsvla_jax.training.planning import roofline
@@ -112,6 +115,14 @@ def dot_flops(jaxpr: Any) -> int:
     return total
 
 
+def traced_flops(experiment: Experiment) -> int:
+    """FLOPs of the products of one training step."""
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+    step = make_train_step(experiment, VLA(experiment.model), optimizer, TARGETS)
+    return dot_flops(jax.make_jaxpr(step)(state, frozen, batches(experiment)[0]).jaxpr)
+
+
 @pytest.mark.parametrize(
     ("fusion", "regime", "remat"),
     [
@@ -128,12 +139,34 @@ def test_flops_counted_by_hand_are_those_of_the_traced_step(fusion, regime, rema
     experiment = dataclasses.replace(
         experiment, regime=regime, model=dataclasses.replace(experiment.model, remat=remat)
     )
-    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    state, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
-    step = make_train_step(experiment, VLA(experiment.model), optimizer, TARGETS)
-    traced = dot_flops(jax.make_jaxpr(step)(state, frozen, batches(experiment)[0]).jaxpr)
     counted = sum(training_flops(experiment).values()) * experiment.batch_size
-    assert 0.97 < traced / counted < 1.03
+    assert 0.97 < traced_flops(experiment) / counted < 1.03
+
+
+def test_utilisation_does_not_count_what_is_computed_again():
+    plain = tiny_experiment("prefix")
+    assert plain.model.remat == "none"
+    again = dataclasses.replace(plain, model=dataclasses.replace(plain.model, remat="full"))
+    assert 0.97 < traced_flops(plain) / (model_flops(again) * again.batch_size) < 1.03
+    assert model_flops(again) < 0.9 * sum(training_flops(again).values())
+
+
+def test_a_peak_is_known_or_not_told():
+    def devices(*kinds: str) -> list[Any]:
+        return [SimpleNamespace(device_kind=kind) for kind in kinds]
+
+    assert peak_flops(devices("TPU v5 lite", "TPU v5 lite")) == 2 * CHIPS["v5e"].flops
+    assert peak_flops(devices("TPU v5 lite", "TPU v99")) is None
+    assert peak_flops(jax.devices("cpu")) is None
+
+
+@pytest.mark.skipif(importlib.util.find_spec("libtpu") is None, reason="needs the TPU compiler")
+@pytest.mark.parametrize(("name", "chip"), [("v4:2x2x1", "v4"), ("v5e:2x2", "v5e"), ("v5p:2x2x1", "v5p")])
+def test_the_names_of_tpus_are_those_that_the_compiler_gives(name, chip):
+    program = "import sys; from dsvla_jax.training.chips import *; d, *_ = find_slice(sys.argv[1]).devices"
+    command = [sys.executable, "-c", f"{program}; print(peak_flops([d]))", name]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert result.stdout.split()[-1:] == [str(CHIPS[chip].flops)], result.stderr
 
 
 def test_seconds_at_the_peaks():

@@ -1,10 +1,11 @@
-"""TPU slices to compile for: their chips, and devices that stand for them where no slice is there."""
+"""Chips and their published peaks; TPU slices to compile for, and devices that stand for them where none is there."""
 
 import dataclasses
 import importlib.util
 import math
 import os
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -31,6 +32,27 @@ CHIPS = {
     "v5p": Chip(459e12, 95e9, 2765e9, 600e9),
     "v6e": Chip(918e12, 32e9, 1640e9, 448e9),
 }
+
+# By the name that JAX gives a device. GPUs: dense bfloat16 products of the data sheets (https://www.nvidia.com, "A100
+# Tensor Core GPU", "H100 Tensor Core GPU", "H200 Tensor Core GPU"), which for the latter two are half of what they
+# state "with sparsity".
+PEAK_FLOPS = {
+    "TPU v4": CHIPS["v4"].flops,
+    "TPU v5 lite": CHIPS["v5e"].flops,
+    "TPU v5": CHIPS["v5p"].flops,
+    "TPU v6 lite": CHIPS["v6e"].flops,
+    "NVIDIA A100-SXM4-40GB": 312e12,
+    "NVIDIA A100-SXM4-80GB": 312e12,
+    "NVIDIA A100 80GB PCIe": 312e12,
+    "NVIDIA H100 80GB HBM3": 989e12,
+    "NVIDIA H200": 989e12,
+}
+
+
+def peak_flops(devices: Sequence[Any]) -> float | None:
+    """bfloat16 products a second of all devices together, as published; None where one of them is not known."""
+    peaks = [PEAK_FLOPS.get(device.device_kind) for device in devices]
+    return sum(known) if len(known := [peak for peak in peaks if peak is not None]) == len(peaks) else None
 
 
 @dataclasses.dataclass(frozen=True)

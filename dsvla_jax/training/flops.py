@@ -34,6 +34,13 @@ def training_flops(experiment: Experiment) -> dict[str, int]:
     return _flops(experiment, experiment.encoding.max_text_length, "training")
 
 
+def model_flops(experiment: Experiment) -> int:
+    """Of one example in one training step, without what rematerialisation computes again: what the utilisation of a
+    chip is counted by (PaLM, https://arxiv.org/abs/2204.02311, appendix B)."""
+    plain = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, remat="none"))
+    return sum(training_flops(plain).values())
+
+
 def prefill_flops(experiment: Experiment) -> dict[str, int]:
     """Of reading one example's picture and prompt before an answer is decoded; the logits of one position."""
     return _flops(experiment, experiment.encoding.max_text_length, "inference")

@@ -57,12 +57,16 @@ class SkippedSteps:
 
 
 class Clock:
-    """Seconds a step, examples and tokens a second, and the share of the time that training waited for data.
+    """Seconds a step, examples and tokens a second, what of the chips that uses, and the share of the time that
+    training waited for data.
 
     Counts from the end of the first step, which compiles.
+
+    flops: of one example in one step. peak: what all chips could do a second; None where nobody has said.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, flops: float, peak: float | None) -> None:
+        self._flops, self._peak = flops, peak
         self._start: float | None = None
         self._reset()
 
@@ -108,7 +112,10 @@ class Clock:
             "examples_per_second": self._examples / seconds,
             "tokens_per_second": self._tokens / seconds,
             "data_wait_share": self._waited / seconds,
+            "model_tflops_per_second": self._examples * self._flops / seconds / 1e12,
         }
+        if self._peak is not None:
+            figures["model_flops_utilisation"] = self._examples * self._flops / seconds / self._peak
         self.start()
         return figures
 

@@ -11,7 +11,9 @@ import numpy as np
 from tqdm import tqdm
 
 from dsvla_jax.checkpoints import Restored, RunCheckpoints
+from dsvla_jax.training.chips import peak_flops
 from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.flops import model_flops
 from dsvla_jax.training.health import Clock, SkippedSteps, memory
 from dsvla_jax.training.metrics import MetricsWriter
 from dsvla_jax.training.signals import StopRequest
@@ -46,7 +48,7 @@ def train(
     Raises UserError where a checkpoint cannot be written, or too many steps were not finite.
     """
     first = done = int(state.step)
-    clock = Clock()
+    clock = Clock(model_flops(experiment), peak_flops(jax.devices()))
     skipped = SkippedSteps(run / "skipped", experiment.max_skipped_steps, int(state.skipped))
     bar = tqdm(total=experiment.steps, initial=first, unit="step", desc="train", disable=jax.process_index() > 0)
     stop: signal.Signals | None = None
