@@ -258,9 +258,11 @@ class Environment:
         release_batch, attach_batch = jit(jax.vmap(self._release_one)), jit(jax.vmap(self._attach_one))
 
         def execute(state: SimState, action: Action) -> SimState:
-            plan = plan_batch(state.ctrl, action)
-            state = stepper(state, plan.controls, self._judge, release_batch(state.eq_active, plan.opening))
-            return attach_batch(state, plan.ok, plan.closing)
+            # Accelerators would otherwise multiply float32 matrices in fewer bits than physics and kinematics bear.
+            with jax.default_matmul_precision("highest"):
+                plan = plan_batch(state.ctrl, action)
+                state = stepper(state, plan.controls, self._judge, release_batch(state.eq_active, plan.opening))
+                return attach_batch(state, plan.ok, plan.closing)
 
         return execute
 
