@@ -53,7 +53,12 @@ def device_loop(
 
     limit: L. longest_instruction: P, see `prompt_table.instruction_tokens`. ``decoding`` must not sample. Keypoints are
     those of the given state, the first frame's.
+    Raises ValueError for what only `rollout.run_episodes` does: C physics, and answers that are displacements.
     """
+    if config.displacement is not None:
+        raise ValueError("device_loop: this policy answers with displacements; run it with rollout.run_episodes")
+    if not hasattr(environment, "execute_in_mjx"):
+        raise ValueError(f"device_loop: expected Environment({environment.task.name!r}, physics='mjx'), not C MuJoCo's")
     encoding, arms = config.encoding, environment.num_arms
     table = make_prompt_table(tokenizer, encoding, arms)
     grammar = build_answer_grammar(tokenizer, arms, encoding.style)

@@ -1,9 +1,12 @@
 """The closed loop on the device against the one on the host, both stepping MJX."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from dsvla_jax.device_rollout import DeviceRollout
+from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.sim.episode import Environment
@@ -25,3 +28,12 @@ def test_both_loops_give_the_same_episodes():
         assert answers == ending.answers
         assert bool(rollout.state.verdict.succeeded[i]) == ending.success
     assert len({answer for ending in endings for answer in ending.answers}) > 1
+
+
+def test_what_only_the_host_loop_can_do_is_refused():
+    environment, policy = Environment("lamp_on", image_size=SIZE), tiny_policy()
+    with pytest.raises(ValueError, match=r"expected Environment.*physics='mjx'"):
+        DeviceRollout(environment, policy)
+    config = dataclasses.replace(policy.config, displacement=DisplacementScale((-1.0,) * 6, (1.0,) * 6))
+    with pytest.raises(ValueError, match=r"answers with displacements; run it with rollout\.run_episodes"):
+        DeviceRollout(environment, dataclasses.replace(policy, config=config))
