@@ -58,7 +58,7 @@ def main(options: Options) -> int:
         return NO_LIBTPU
     mesh = make_mesh(MeshConfig(data=1, fsdp=-1), where.devices)
     experiment = paper_7b()
-    model = dataclasses.replace(experiment.model, remat="none")
+    model = dataclasses.replace(experiment.model, remat="none", attention="fused")
     environment = Environment(options.task, "mjx", image_size=experiment.data.image_size)
     tokenizer = words(model.language.vocab_size, environment.task.all_instructions())
     policy = PolicyConfig(experiment.encoding, model)
