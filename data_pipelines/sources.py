@@ -5,9 +5,9 @@ from pathlib import Path
 
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
+from data_pipelines.vocabulary import check_words
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, split_words
-from dsvla_jax.errors import UserError
+from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.sim.tasks import select_tasks
 
 
@@ -32,18 +32,5 @@ def open_demonstrations(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader
     reader = EpisodeReader(folder, tasks=tasks, episodes=data.episodes, fewer=True)
     if (present := len(EpisodeReader(folder, tasks=tasks))) > len(reader):
         print(f"{folder}: {len(reader)} of {present} demonstrations are used (data.episodes is {data.episodes} a task)")
-    check_words(reader, tokenizer)
+    check_words(folder, reader.instructions, tokenizer, f"python -m data_pipelines.vocabulary {folder} OUT")
     return reader
-
-
-def check_words(reader: EpisodeReader, tokenizer: Tokenizer) -> None:
-    """Raises UserError where a word of an instruction would become <unk>."""
-    if not isinstance(tokenizer, WordTokenizer):
-        return
-    words = {word for text in reader.instructions for word in split_words(text) if not word.lstrip("-").isdigit()}
-    if unknown := sorted(words - set(tokenizer.words)):
-        some = ", ".join(map(repr, unknown[:5])) + (f" and {len(unknown) - 5} more" if len(unknown) > 5 else "")
-        raise UserError(
-            f"{reader.folder}: the vocabulary has no token for {some}; write one with `python -m "
-            f"data_pipelines.vocabulary {reader.folder} OUT`, and train with the options that it prints"
-        )

@@ -1,17 +1,19 @@
 """Write a word-level vocabulary for demonstrations of one's own: python -m data_pipelines.vocabulary FOLDER OUT
 
 It has the words of the task suite and those of the folder's instructions, for configs whose language model starts from
-scratch, such as `tiny`.
+scratch, such as `tiny`. For Open X-Embodiment: python -m data_pipelines.oxe vocabulary OUT.
 """
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 
 import tyro
 
 from data_pipelines.episodes import EpisodeReader
 from dsvla_jax.command_line import fail_with_message
-from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, split_words, vocabulary
+from dsvla_jax.errors import UserError
 from dsvla_jax.sim.tasks import TASKS
 
 
@@ -25,16 +27,30 @@ class Options:
     """The folder to write tokenizer.json into."""
 
 
-def main(options: Options) -> None:
-    """Writes the vocabulary and prints how to train with it."""
+def write_vocabulary(out: Path, texts: Iterable[str]) -> None:
+    """Writes the words of the task suite and of the texts, and prints how to train with them."""
     suite = [text for task in TASKS.values() for text in task.all_instructions()]
-    tokenizer = WordTokenizer(vocabulary([*suite, *EpisodeReader(options.folder).instructions]))
-    options.out.mkdir(parents=True, exist_ok=True)
-    tokenizer.save(options.out)
-    print(f"{options.out / 'tokenizer.json'}: {tokenizer.vocab_size} tokens; train with")
-    print(f"  --tokenizer {options.out} --model.language.vocab-size {tokenizer.vocab_size}")
+    tokenizer = WordTokenizer(vocabulary([*suite, *texts]))
+    out.mkdir(parents=True, exist_ok=True)
+    tokenizer.save(out)
+    print(f"{out / 'tokenizer.json'}: {tokenizer.vocab_size} tokens; train with")
+    print(f"  --tokenizer {out} --model.language.vocab-size {tokenizer.vocab_size}")
+
+
+def check_words(where: object, texts: Iterable[str], tokenizer: Tokenizer, command: str) -> None:
+    """Raises UserError where a word of a text would become <unk>. command: what writes a vocabulary that has it."""
+    if not isinstance(tokenizer, WordTokenizer):
+        return
+    words = {word for text in texts for word in split_words(text) if not word.lstrip("-").isdigit()}
+    if unknown := sorted(words - set(tokenizer.words)):
+        some = ", ".join(map(repr, unknown[:5])) + (f" and {len(unknown) - 5} more" if len(unknown) > 5 else "")
+        raise UserError(
+            f"{where}: the vocabulary has no token for {some}; write one with `{command}`, and train with the options"
+            " that it prints"
+        )
 
 
 if __name__ == "__main__":
     with fail_with_message():
-        main(tyro.cli(Options, prog="python -m data_pipelines.vocabulary", description=__doc__))
+        options = tyro.cli(Options, prog="python -m data_pipelines.vocabulary", description=__doc__)
+        write_vocabulary(options.out, EpisodeReader(options.folder).instructions)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_pipelines.oxe.__main__ import vocabulary as write_words
 from data_pipelines.oxe.fixtures import known_episodes, write_fixture
 from data_pipelines.oxe.fixtures_converted import DEPTH_COUNTS, camera_from_world
 from data_pipelines.oxe.index import load_index, scan
@@ -24,7 +25,9 @@ from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
 from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.errors import UserError
 
 FIVE = ("nyu_rot_dataset_converted_externally_to_rlds=3", "austin_sirius_dataset_converted_externally_to_rlds",
@@ -383,6 +386,22 @@ def test_no_picture_is_decoded_for_statistics(tmp_path, monkeypatch):
     write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6)
     monkeypatch.setattr("cv2.imdecode", lambda *_: pytest.fail("decoded"))
     scan(RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch"), config_for(tmp_path), progress=False)
+
+
+def test_unknown_words_need_a_vocabulary(folder, tmp_path, capsys):
+    config = config_for(folder)
+    few = WordTokenizer(vocabulary(["turn on the light", "close the fridge"]))
+
+    def make_with(tokenizer):
+        return OxeLoader(config, ENCODING, tokenizer, batch_size=4, seed=0, num_threads=0, progress=False)
+
+    with pytest.raises(UserError, match=r"no token for 'ball', 'bin', 'lift', 'put', 'rubbish'; write one with `"):
+        make_with(few)
+    write_words(tmp_path / "words", config)
+    tokenizer = load_tokenizer(tmp_path / "words")
+    assert f"--model.language.vocab-size {tokenizer.vocab_size}" in capsys.readouterr().out
+    batch = next(make_with(tokenizer))
+    assert not np.any(batch["text_tokens"] == few.unk_id)
 
 
 def test_datasets_that_cannot_give_the_targets(folder):

@@ -9,12 +9,12 @@ import jax
 import numpy as np
 import pytest
 
+from data_pipelines.episodes import EpisodeReader
 from data_pipelines.loader import make_loader
 from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
 from data_pipelines.samples import make_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations
-from data_pipelines.vocabulary import Options
-from data_pipelines.vocabulary import main as write_vocabulary
+from data_pipelines.vocabulary import write_vocabulary
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.number_targets import number_rows
@@ -65,7 +65,7 @@ def test_unknown_words_need_a_vocabulary(tmp_path, capsys):
     data = data_config(tmp_path / "out", tasks=("rinse_mug",))
     with pytest.raises(UserError, match=r"no token for 'mug', 'rinse', 'times'; write one with .*vocabulary"):
         open_demonstrations(data, suite_tokenizer())
-    write_vocabulary(Options(tmp_path / "out", tmp_path / "words"))
+    write_vocabulary(tmp_path / "words", EpisodeReader(tmp_path / "out").instructions)
     tokenizer = load_tokenizer(tmp_path / "words")
     assert f"--model.language.vocab-size {tokenizer.vocab_size}" in capsys.readouterr().out
     open_demonstrations(data, tokenizer)

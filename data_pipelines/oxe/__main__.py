@@ -1,7 +1,8 @@
-"""Open X-Embodiment data on the command line: what there is, whether it is whole, its statistics, and fixtures.
+"""Open X-Embodiment data on the command line: what there is, whether it is whole, statistics, words, and fixtures.
 
 python -m data_pipelines.oxe list [NAME ...]
 python -m data_pipelines.oxe prepare --folder data/oxe --mixture bridge_dataset fractal20220817_data=0.5
+python -m data_pipelines.oxe vocabulary words/bridge --folder data/oxe --mixture bridge_dataset
 python -m data_pipelines.oxe fixtures data/oxe_fixtures --datasets bridge_dataset viola
 """
 
@@ -18,6 +19,7 @@ from data_pipelines.oxe.fixtures import write_fixtures
 from data_pipelines.oxe.mixture import MixtureSource
 from data_pipelines.oxe.registry import DATASETS, MIXTURES, get_dataset
 from data_pipelines.oxe.scale import MixtureScale
+from data_pipelines.vocabulary import write_vocabulary
 from dsvla_jax.command_line import fail_with_message
 from dsvla_jax.data_config import OxeConfig
 
@@ -67,6 +69,16 @@ def prepare(config: Annotated[OxeConfig, tyro.conf.arg(name="")], seed: int = 0)
         print("displacement from", np.round(scale.low, 4), "to", np.round(scale.high, 4), "(metres and radians)")
 
 
+def vocabulary(out: tyro.conf.Positional[Path], config: Annotated[OxeConfig, tyro.conf.arg(name="")]) -> None:
+    """Writes a word-level vocabulary of a mixture's instructions, for configs whose language model starts from scratch.
+
+    Args:
+        out: the folder to write tokenizer.json into.
+        config: the mixture, as training takes it.
+    """
+    write_vocabulary(out, MixtureSource(config, seed=0).words)
+
+
 def fixtures(
     folder: tyro.conf.Positional[Path], datasets: tuple[str, ...] = (), episodes: int = 16, steps: int = 12
 ) -> None:
@@ -85,7 +97,7 @@ def fixtures(
 
 if __name__ == "__main__":
     with fail_with_message():
-        commands: dict[str, Any] = {"list": list_, "prepare": prepare, "fixtures": fixtures}
+        commands: dict[str, Any] = {"list": list_, "prepare": prepare, "vocabulary": vocabulary, "fixtures": fixtures}
         if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
             print(__doc__)
             sys.exit(0 if len(sys.argv) > 1 else 2)

@@ -15,7 +15,8 @@ import numpy as np
 from tqdm import tqdm
 
 from data_pipelines.oxe import dataset as dataset_module
-from data_pipelines.oxe import datasets_converted, datasets_other, datasets_rtx, motion, targets
+from data_pipelines.oxe import datasets_converted, datasets_other, datasets_rtx, targets
+from data_pipelines.oxe import motion as motion_module
 from data_pipelines.oxe.dataset import OxeDataset
 from data_pipelines.oxe.targets import make_targets
 from data_pipelines.records import DataError
@@ -23,8 +24,9 @@ from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild, Shard, TFRecordFile
 from dsvla_jax.command_line import cache_folder
 from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding.text import split_words
 
-VERSION = 1
+VERSION = 2
 KEPT_ROWS = 1 << 18
 """Rows of displacements that quantiles are taken from; of more, evenly spaced ones are kept."""
 QUANTILES = 101
@@ -36,7 +38,8 @@ class Index:
 
     shards: paths. offsets: of each TFRecord shard, else None. shard, record, samples: int64 (E,), of the E usable
     episodes: where each is, and how many samples it gives. quantiles: (101, 6) of all arms' displacements, ascending,
-    or None for absolute targets. bytes: of an average record. left_out: record and reason, of skipped ones.
+    or None for absolute targets. words: all words and signs of the instructions. bytes: of an average record. left_out:
+    record and reason, of skipped ones.
     """
 
     shards: list[str]
@@ -45,6 +48,7 @@ class Index:
     record: np.ndarray
     samples: np.ndarray
     quantiles: np.ndarray | None
+    words: list[str]
     bytes: float
     left_out: list[tuple[str, str]]
 
@@ -77,6 +81,7 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
     rows, spacing, left_out = [], 1, []
     places: list[tuple[int, int, int]] = []
     offsets: list[np.ndarray] = []
+    words: set[str] = set()
     seen = size = count = 0
     total = sum(shard.records for shard in shards)
     bar = tqdm(total=total, unit="episode", desc=f"index {dataset.name}", disable=not progress, leave=False)
@@ -100,11 +105,13 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
                 episode = build.parse(data, where)
                 if dataset.keep is not None and not dataset.keep(episode):
                     continue
-                made = make_targets(dataset.motion(episode), dataset, config)
+                motion = dataset.motion(episode)
+                made = make_targets(motion, dataset, config)
                 check_pictures(episode, dataset)
             except DataError as error:
                 _leave_out(error, where, left_out, config)
                 continue
+            words.update(split_words(motion.instruction))
             size, count = size + len(data), count + 1
             if len(made.frame):
                 places.append((number, record, len(made.frame)))
@@ -127,6 +134,7 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
         record=record_of,
         samples=samples,
         quantiles=quantiles,
+        words=sorted(words),
         bytes=size / max(count, 1),
         left_out=left_out,
     )
@@ -156,7 +164,7 @@ def _leave_out(error: DataError, where: str, left_out: list[tuple[str, str]], co
 
 def _fingerprint(build: RldsBuild, dataset: OxeDataset, config: OxeConfig) -> str:
     """Changes where the files, the features, the code that reads them or the targets change."""
-    code = [dataset_module, datasets_converted, datasets_other, datasets_rtx, motion, targets]
+    code = [dataset_module, datasets_converted, datasets_other, datasets_rtx, motion_module, targets]
     parts = [
         str(VERSION),
         json.dumps(build.features_json, sort_keys=True),

@@ -13,6 +13,7 @@ from data_pipelines.oxe.mixture import ENDLESS, EncodedSample, MixtureSource
 from data_pipelines.oxe.samples import make_batcher
 from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.records import DataError
+from data_pipelines.vocabulary import check_words
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.encode import EncodingConfig
@@ -44,6 +45,8 @@ class OxeLoader(Iterator[Sample]):
         The order depends on `seed` and the config only: not on processes, threads or where a run was interrupted.
         """
         self.source = MixtureSource(config, seed, progress)
+        command = f"python -m data_pipelines.oxe vocabulary OUT --folder {config.folder} --mixture"
+        check_words(config.folder, self.source.words, tokenizer, f"{command} {' '.join(config.mixture)}")
         if encoding.use_points:
             flat = [item.dataset.name for item in self.source.datasets if item.dataset.depth is None]
             if flat:

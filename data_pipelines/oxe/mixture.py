@@ -181,6 +181,11 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
         return sum(source.index.num_samples for source in self.datasets)
 
     @property
+    def words(self) -> list[str]:
+        """All words and signs of the instructions."""
+        return sorted({word for source in self.datasets for word in source.index.words})
+
+    @property
     def left_out(self) -> list[tuple[str, str]]:
         """Records that were skipped, and why."""
         return [entry for source in self.datasets for entry in source.index.left_out]
