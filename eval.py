@@ -4,23 +4,21 @@ Every episode starts from a seed that no demonstration used. Prints success rate
 in RUN/eval, one line of JSON an episode and an HTML report with a film strip of each.
 """
 
-import contextlib
 import dataclasses
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 import dsvla_jax.policy
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.compile_times import first_use
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.decode import Decoding
 from dsvla_jax.policy import Policy
@@ -34,10 +32,9 @@ from dsvla_jax.report import (
     write_report,
     write_results,
 )
-from dsvla_jax.rollout import Ending, run_episodes
+from dsvla_jax.rollout import Ending, run_task
 from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.shifts import check_shifts
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, load_experiment
@@ -141,33 +138,20 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
     environment = Environment(
         name, physics=options.physics, image_size=experiment.data.image_size, shifts=options.shift
     )
-    size = min(episodes, options.batch)
-    endings: list[Ending] = []
-    with tqdm(total=episodes, desc=f"{name} ({options.physics})", unit="episode") as bar:
-        for start in range(0, episodes, size):
-            # The last batch is filled up with further episodes: another size would compile again.
-            keys = episode_keys(options.seed, "eval", name, start, size)
-            told = first_use(f"{name} {options.physics} x {size}", bar.set_postfix_str)
-            with told if start == 0 else contextlib.nullcontext():
-                state = environment.reset(keys)
-                own = environment.keypoints(state)
-            noise = np.random.default_rng([options.seed, start]).uniform(-1, 1, own.shape)
-            found = None
-            if options.keypoints != "oracle":
-                refresh = options.keypoints == "segmentation-refresh"
-                found = SegmentationKeypoints(environment, state, refresh)
-            endings += run_episodes(
-                environment,
-                policy.act,
-                state,
-                noise=noise * options.keypoint_noise,
-                find_keypoints=found,
-                on_keyframe=lambda done, succeeded: bar.set_postfix_str(
-                    f"key pose {done}, {succeeded}/{size} succeeded"
-                ),
-            )
-            bar.update(min(size, episodes - start))
-    return endings[:episodes]
+    found = None
+    if options.keypoints != "oracle":
+        found = partial(SegmentationKeypoints, environment, refresh=options.keypoints == "segmentation-refresh")
+    return run_task(
+        environment,
+        policy.act,
+        episodes,
+        split="eval",
+        seed=options.seed,
+        batch=options.batch,
+        keypoint_noise=options.keypoint_noise,
+        find_keypoints=found,
+        label=f"{name} ({options.physics})",
+    )
 
 
 def save_strips(file: Path, task: str, endings: Sequence[Ending]) -> None:

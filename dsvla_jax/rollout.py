@@ -3,15 +3,19 @@
 A policy is any function (Observation, B instructions, active keypoints (B, A, 3)) -> (Action, B answers as text).
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
+from tqdm import tqdm
 
+from dsvla_jax.compile_times import first_use
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
+from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action, Camera, Observation
 
 Act = Callable[[Observation, Sequence[str], np.ndarray], tuple[Action, Sequence[str]]]
@@ -36,6 +40,55 @@ class Ending:
     frames: list[np.ndarray]
     camera: Camera
     targets: list[np.ndarray]
+
+
+class Stopped(Exception):
+    """Episodes were given up half-way, because `run_task` was told to stop."""
+
+
+def run_task(
+    environment: Environment,
+    act: Act,
+    episodes: int,
+    *,
+    split: str,
+    seed: int = 0,
+    batch: int = 100,
+    keypoint_noise: float = 0.0,
+    find_keypoints: Callable[[SimState], KeypointSource] | None = None,
+    label: str = "",
+    stop: Callable[[], bool] = lambda: False,
+) -> list[Ending]:
+    """The first `episodes` of a split's stream of one task, `batch` of them side by side, with a progress bar.
+
+    keypoint_noise: metres of uniform noise an axis on every keypoint.
+    find_keypoints: makes what finds the keypoints of a batch from its reset state; the task's own if not given.
+    label: for people, in place of the task's name.
+    stop: asked after every key pose; raises Stopped where it says so.
+    """
+    name, size = environment.task.name, min(episodes, batch)
+    endings: list[Ending] = []
+    with tqdm(total=episodes, desc=label or name, unit="episode", leave=None) as bar:
+
+        def told(done: int, succeeded: int) -> None:
+            bar.set_postfix_str(f"key pose {done}, {succeeded}/{size} succeeded")
+            if stop():
+                raise Stopped
+
+        for start in range(0, episodes, size):
+            # The last batch is filled up with further episodes: another size would compile again.
+            keys = episode_keys(seed, split, name, start, size)
+            compiling = first_use(f"{label or name} x {size}", bar.set_postfix_str)
+            with compiling if start == 0 else contextlib.nullcontext():
+                state = environment.reset(keys)
+                keypoints = environment.keypoints(state)
+            noise = np.random.default_rng([seed, start]).uniform(-1, 1, keypoints.shape)
+            found = None if find_keypoints is None else find_keypoints(state)
+            endings += run_episodes(
+                environment, act, state, noise=noise * keypoint_noise, find_keypoints=found, on_keyframe=told
+            )
+            bar.update(min(size, episodes - start))
+    return endings[:episodes]
 
 
 def run_episodes(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.rollout import run_episodes
+from dsvla_jax.rollout import Stopped, run_episodes, run_task
 from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
@@ -48,6 +48,34 @@ def plan_of(task: str) -> Action:
 
 def reasons(task: str, plan: Action) -> list[str]:
     return [ending.reason for ending in run_episodes(environment(task), follow(plan), start_of(task))]
+
+
+def test_a_task_is_run_in_batches_from_the_seeds_of_its_split():
+    poses, grippers = (np.asarray(part) for part in (plan_of("lamp_on").pose, plan_of("lamp_on").gripper_open))
+    calls = []
+
+    def act(observation, instructions, keypoints):
+        batch, m = divmod(len(calls), poses.shape[1])
+        rows = slice(2 * batch, 2 * batch + 2)
+        calls.append(len(instructions))
+        return Action(jnp.asarray(poses[rows, m]), jnp.asarray(grippers[rows, m])), ["go"] * len(instructions)
+
+    endings = run_task(environment("lamp_on"), act, 3, split="validation", seed=11, batch=2)
+    # The plans are those of these seeds in this order: from other starts they would not succeed.
+    assert [ending.success for ending in endings] == [True] * 3
+    assert calls == [2] * (2 * poses.shape[1]), "the last batch is filled up"
+
+
+def test_episodes_are_given_up_after_a_key_pose():
+    plan, asked = plan_of("lamp_on"), []
+
+    def stop() -> bool:
+        asked.append(True)
+        return len(asked) == 2
+
+    with pytest.raises(Stopped):
+        run_task(environment("lamp_on"), follow(plan), EPISODES, split="validation", seed=11, stop=stop)
+    assert len(asked) == 2
 
 
 def test_an_episode_ends_with_its_success():
