@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,7 @@ def _start_wandb(run: Path, project: str, config: Mapping[str, Any]) -> Any:
         raise UserError("--wandb: the package is not installed; install it with: pip install wandb") from error
     name = run / "wandb_id.txt"
     if not name.exists():
-        name.write_text(wandb.util.generate_id())
+        name.write_text(secrets.token_hex(4))
     session = wandb.init(
         project=project, id=name.read_text(), resume="allow", dir=run, name=run.name, config=dict(config)
     )
