@@ -8,9 +8,10 @@ goes on when the same command is given again; a finished one is left as it is.
 import contextlib
 import dataclasses
 import fcntl
+import itertools
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,8 +23,8 @@ import tyro
 import dsvla_jax.policy
 from configs import config_names, get_config
 from data_pipelines.loader import make_loader
-from data_pipelines.samples import make_sampler, suite_tokenizer
-from data_pipelines.sources import choose_tasks, open_demonstrations
+from data_pipelines.samples import make_sampler, make_validation_sampler, suite_tokenizer
+from data_pipelines.sources import choose_tasks, open_demonstrations, open_held_out
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
 from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory
 from dsvla_jax.encoding.displacement import DisplacementScale
@@ -32,8 +33,12 @@ from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import make_sharded
+from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.policy import PolicyConfig, save_policy_config
+from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
+from dsvla_jax.rollout import Stopped, run_task
+from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training import loop
 from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes
 from dsvla_jax.training.experiment import Experiment, load_experiment, outcome_differences, save_experiment
@@ -41,6 +46,7 @@ from dsvla_jax.training.metrics import MetricsWriter
 from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch
 from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.training.validation import jit_validation, mean_errors
 from dsvla_jax.weights.base import is_imported, load_for_model
 
 # Embeddings have more rows than the vocabulary has tokens where their number was rounded up, by fewer than so many.
@@ -53,6 +59,7 @@ def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "")
     if experiment.oxe is None:
         tasks = choose_tasks(experiment.data)
         experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
+    require_possible(experiment)
     mesh = make_mesh(experiment.mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     require_same_experiment(run, experiment)
@@ -85,6 +92,7 @@ def train(
 ) -> signal.Signals | None:
     """Trains from the newest checkpoint, or from the beginning. Returns the signal that stopped it, if one did."""
     batches, samples, displacement = open_data(experiment, tokenizer, part)
+    held_out = open_validation(experiment, tokenizer, part)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
     state, frozen = make_sharded(start, mesh, base_variables(experiment, mesh))
@@ -107,6 +115,15 @@ def train(
     def step(state: TrainState, batch: Mapping[str, np.ndarray]) -> tuple[TrainState, dict[str, Any]]:
         return compiled(state, frozen, put_batch(dict(batch), mesh))
 
+    sums = jit_validation(experiment, targets, mesh)
+
+    def validate(state: TrainState, _: Callable[[], bool]) -> dict[str, float]:
+        return mean_errors(sums, state.trainable, frozen, held_out(), mesh)
+
+    checks = (
+        loop.Check("validating", experiment.validate_every, validate),
+        loop.Check("evaluating", experiment.evaluate_every, make_evaluation(experiment, tokenizer, frozen)),
+    )
     with MetricsWriter(run, int(state.step), wandb, dataclasses.asdict(experiment)) as metrics:
         return loop.train(
             experiment,
@@ -116,6 +133,7 @@ def train(
             batches=batches,
             checkpoints=checkpoints,
             metrics=metrics,
+            checks=checks,
             note=watchdog.doing,
         )
 
@@ -142,6 +160,76 @@ def open_data(
         reader = open_demonstrations(experiment.data, tokenizer)
     sample = make_sampler(experiment.data, experiment.encoding, tokenizer)
     return make_loader(reader, sample, **order), reader.num_frames, None
+
+
+def open_validation(
+    experiment: Experiment, tokenizer: Tokenizer, part: BatchPart
+) -> Callable[[], Iterator[Mapping[str, np.ndarray]]]:
+    """This process's parts of the batches to validate with, from their beginning each time: never training's stream.
+    None where nothing is validated."""
+    if not experiment.validate_every:
+        return lambda: iter(())
+    with first_process_first("held-out demonstrations"):
+        reader = open_held_out(experiment.data, tokenizer, experiment.validation.episodes)
+    sample = make_validation_sampler(experiment.data, experiment.encoding, tokenizer)
+    # A pass forward over the part of a batch that is trained on at a time fits where training does.
+    size = part.size // experiment.gradient_accumulation
+    count = min(experiment.validation.batches, max(reader.num_frames // (size * part.count), 1))
+    order: dict[str, Any] = {"seed": experiment.seed, "process_index": part.index, "process_count": part.count}
+
+    def batches() -> Iterator[Mapping[str, np.ndarray]]:
+        return itertools.islice(make_loader(reader, sample, batch_size=size, num_threads=0, **order), count)
+
+    return batches
+
+
+def make_evaluation(
+    experiment: Experiment, tokenizer: Tokenizer, frozen: Variables
+) -> Callable[[TrainState, Callable[[], bool]], dict[str, float]]:
+    """Success rates of the present weights on the training tasks, from seeds that neither training nor eval.py has."""
+    environments: dict[str, Environment] = {}
+
+    def evaluate(state: TrainState, stop: Callable[[], bool]) -> dict[str, float]:
+        config = PolicyConfig(experiment.encoding, experiment.model)
+        policy = Policy(config, join_variables(state.trainable, frozen), tokenizer)
+        rates: dict[str, float] = {}
+        for name in experiment.data.tasks:
+            if name not in environments:
+                environments[name] = Environment(name, image_size=experiment.data.image_size)
+            try:
+                endings = run_task(
+                    environments[name],
+                    policy.act,
+                    experiment.evaluation.episodes_while_training,
+                    split="validation",
+                    seed=experiment.data.seed,
+                    stop=stop,
+                )
+            except Stopped:
+                return {}
+            rates[f"evaluation/{name}"] = float(np.mean([ending.success for ending in endings]))
+        return {**rates, "evaluation/success": float(np.mean(list(rates.values())))}
+
+    return evaluate
+
+
+def require_possible(experiment: Experiment) -> None:
+    """Raises UserError where training cannot be watched as asked for."""
+    if experiment.evaluate_every:
+        if experiment.oxe is not None:
+            raise UserError("evaluate_every: the simulator has no tasks of Open X-Embodiment; set it to 0")
+        if jax.process_count() > 1:
+            raise UserError(
+                f"evaluate_every: episodes run in one process, and this job has {jax.process_count()}, none of which "
+                "holds all weights; set it to 0, use --validate-every, and evaluate checkpoints beside the job: python "
+                "eval.py RUN"
+            )
+        select_tasks(experiment.data.tasks)
+    if experiment.validate_every and experiment.oxe is not None:
+        raise UserError(
+            "validate_every: nothing is held out of Open X-Embodiment mixtures, whose displacements are binned over "
+            "what training learns from; set it to 0, and judge the run by what is finetuned from it"
+        )
 
 
 def tokenizer_of(experiment: Experiment) -> Tokenizer:

@@ -150,8 +150,8 @@ class EpisodeReader:
     Opening checks that every shard is complete; ``verify="sha256"`` reads them all and compares digests too.
     Episodes and frames are numbered through all shards, task by task, in the order in which they were written.
     `num_arms` is by task, `instructions` are those of the shards.
-    tasks: which tasks; all if None. episodes: only the first so many of each task; all if None. `fewer`: whether a task
-    may have fewer.
+    tasks: which tasks; all if None. episodes: only the first so many of each task; all if None. skip: without so many
+    before them. `fewer`: whether a task may have fewer.
     """
 
     def __init__(
@@ -159,6 +159,7 @@ class EpisodeReader:
         folder: Path | str,
         tasks: Sequence[str] | None = None,
         episodes: int | None = None,
+        skip: int = 0,
         fewer: bool = False,
         verify: Literal["size", "sha256"] = "size",
     ):
@@ -175,7 +176,9 @@ class EpisodeReader:
             )
         self.tasks = tuple(present if tasks is None else tasks)
         self.settings: dict[str, Any] = index["settings"]
-        self._shards = [shard for task in self.tasks for shard in self._choose(index["shards"], task, episodes, fewer)]
+        self._shards = [
+            shard for task in self.tasks for shard in self._choose(index["shards"], task, episodes, skip, fewer)
+        ]
         if not self._shards:
             raise DataError(self.folder, "shards", "at least one episode", "none", "generate demonstrations first")
         for entry in self._shards:
@@ -190,18 +193,19 @@ class EpisodeReader:
         self._open: dict[int, Any] = {}
 
     def _choose(
-        self, shards: Sequence[dict[str, Any]], task: str, episodes: int | None, fewer: bool
+        self, shards: Sequence[dict[str, Any]], task: str, episodes: int | None, skip: int, fewer: bool
     ) -> list[dict[str, Any]]:
-        """The task's shards, cut down to the first `episodes` of it."""
+        """The task's shards, cut down to `episodes` of it after the first `skip`; `first` is where a shard begins."""
         mine = [shard for shard in shards if shard["task"] == task]
-        count = sum(len(shard["frames"]) for shard in mine)
+        count = max(sum(len(shard["frames"]) for shard in mine) - skip, 0)
         if episodes is not None and count < episodes and not fewer:
             fix = f"run `python -m data_pipelines.demos {self.folder} --tasks {task} --episodes {episodes}`"
             raise DataError(self.folder, f"episodes of {task}", f"at least {episodes}", str(count), fix)
         chosen, left = [], count if episodes is None else episodes
         for shard in mine:
-            chosen.append({**shard, "frames": shard["frames"][:left]})
-            left -= len(chosen[-1]["frames"])
+            first = min(skip, len(shard["frames"]))
+            chosen.append({**shard, "frames": shard["frames"][first : first + left], "first": first})
+            skip, left = skip - first, left - len(chosen[-1]["frames"])
         return [shard for shard in chosen if shard["frames"]]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -223,7 +227,7 @@ class EpisodeReader:
         path = self.folder / self._shards[shard]["file"]
         if shard not in self._open:
             self._open[shard] = array_record_module.ArrayRecordReader(str(path), options="readahead_buffer_size:0")
-        place = number - int(self._first_episode[shard])
+        place = number - int(self._first_episode[shard]) + self._shards[shard]["first"]
         (record,) = self._open[shard].read([place])
         return unpack_episode(record, f"{path}, episode {place}")
 

@@ -9,6 +9,7 @@ The sample is a flat dict of arrays of fixed shape, in which one- and two-armed 
 rotation which choice it is (`encoding.number_targets`), and is 0 elsewhere.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 
@@ -76,5 +77,32 @@ def make_sampler(
             "answer_mask": answer_mask,
             "number_rows": rows,
         }
+
+    return sample
+
+
+def make_validation_sampler(
+    data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer
+) -> Callable[[Frame, np.random.Generator], Sample]:
+    """As `make_sampler`, of frames as they were recorded, with what the numbers of an answer are compared with:
+
+    integers int32 (2, 8), the answer's, zeros for a second arm that is not there; number_of int32 (T,), which of them,
+    counted from 1, each token belongs to, and 0 for tokens that belong to none.
+    """
+    plain = make_sampler(
+        dataclasses.replace(data, shift_world=0, crop=1, colour_variation=0, state_jitter=0, keypoint_noise=0),
+        encoding,
+        tokenizer,
+    )
+    numbers = number_rows(tokenizer, encoding.style)
+
+    def sample(frame: Frame, rng: np.random.Generator) -> Sample:
+        one = plain(frame, rng)
+        bins = np.asarray(encoding.codec.encode(frame["target_pose"], frame["target_gripper"]))
+        integers = np.zeros((2, bins.shape[1]), np.int32)
+        integers[: len(bins)] = bins
+        number_of = np.zeros_like(one["number_rows"])
+        number_of[one["answer_mask"]] = numbers.numbers(bins)
+        return {**one, "integers": integers, "number_of": number_of}
 
     return sample

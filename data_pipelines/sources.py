@@ -2,12 +2,14 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.vocabulary import check_words
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.errors import UserError
 from dsvla_jax.sim.tasks import select_tasks
 
 
@@ -26,11 +28,38 @@ def open_demonstrations(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader
     """
     folder, tasks, workers = Path(data.folder), choose_tasks(data), os.cpu_count() or 1
     if data.source == "simulator":
-        settings = {"image_size": data.image_size, "seed": data.seed, "perturb": data.perturb}
-        generate_demonstrations(folder, tasks, data.episodes, workers=workers, **settings)
+        generate_demonstrations(folder, tasks, data.episodes, workers=workers, **_simulator_settings(data))
         return EpisodeReader(folder, tasks=tasks, episodes=data.episodes)
     reader = EpisodeReader(folder, tasks=tasks, episodes=data.episodes, fewer=True)
     if (present := len(EpisodeReader(folder, tasks=tasks))) > len(reader):
         print(f"{folder}: {len(reader)} of {present} demonstrations are used (data.episodes is {data.episodes} a task)")
     check_words(folder, reader.instructions, tokenizer, f"python -m data_pipelines.vocabulary {folder} OUT")
     return reader
+
+
+def open_held_out(data: DataConfig, tokenizer: Tokenizer, episodes: int) -> EpisodeReader:
+    """Demonstrations of ``data.tasks`` that `open_demonstrations` does not give: whole episodes, `episodes` a task.
+
+    Those of the simulator start from other seeds, and are made first where they are missing, in a folder beside that of
+    training; of a folder's they are what follows the first ``data.episodes`` of each task.
+    Raises UserError where there are none of a task.
+    """
+    tasks = choose_tasks(data)
+    if data.source == "simulator":
+        folder, workers = Path(f"{data.folder}_validation"), os.cpu_count() or 1
+        settings = _simulator_settings(data)
+        generate_demonstrations(folder, tasks, episodes, workers=workers, split="validation", **settings)
+        return EpisodeReader(folder, tasks=tasks, episodes=episodes)
+    folder = Path(data.folder)
+    if used := [task for task in tasks if len(EpisodeReader(folder, tasks=(task,))) <= data.episodes]:
+        raise UserError(
+            f"{folder}: training uses all demonstrations of {', '.join(used)}, so none are left to validate with; use "
+            "fewer of each task (--data.episodes), or turn validation off (--validate-every 0)"
+        )
+    reader = EpisodeReader(folder, tasks=tasks, episodes=episodes, skip=data.episodes, fewer=True)
+    check_words(folder, reader.instructions, tokenizer, f"python -m data_pipelines.vocabulary {folder} OUT")
+    return reader
+
+
+def _simulator_settings(data: DataConfig) -> dict[str, Any]:
+    return {"image_size": data.image_size, "seed": data.seed, "perturb": data.perturb}

@@ -182,7 +182,7 @@ def load(
 ) -> Policy:
     """The policy of a run folder, split over the mesh if there is one.
 
-    step: the checkpoint whose weights it gets: a number, "best" by validation, or the newest if not given.
+    step: the checkpoint whose weights it gets: a number, "best" by its score, or the newest if not given.
     Raises CheckpointError naming what is missing or does not fit.
     """
     config = load_policy_config(run)

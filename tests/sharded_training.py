@@ -26,7 +26,7 @@ VOCABULARY = 40
 # One choice of a bin, between four tokens.
 TARGETS = NumberTargets(
     tokens=np.arange(4, 8, dtype=np.int32),
-    distances=np.array([[np.inf] * 4, [0, 1, 2, 3]], np.float32),
+    offsets=np.array([[np.inf] * 4, [0, 1, 2, 3]], np.float32),
     weights=np.array([[0.0] * 4, [0.6, 0.3, 0.1, 0.0]], np.float32),
     begins=np.array([False, True]),
 )

@@ -4,7 +4,7 @@ import functools
 import json
 import os
 import signal
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -67,6 +67,7 @@ def train(
     experiment: Experiment = EXPERIMENT,
     bad: Collection[int] = (),
     at_step: Callable[[int], None] = lambda step: None,
+    checks: Sequence[loop.Check] = (),
 ) -> signal.Signals | None:
     """Trains as train.py does; `at_step` is called before each step of this process."""
     run.mkdir(exist_ok=True)
@@ -83,7 +84,14 @@ def train(
             batches.set_state(restored.notes["iterator"])
         with MetricsWriter(run, int(state.step)) as metrics:
             return loop.train(
-                experiment, run, state=state, step=step, batches=batches, checkpoints=checkpoints, metrics=metrics
+                experiment,
+                run,
+                state=state,
+                step=step,
+                batches=batches,
+                checkpoints=checkpoints,
+                metrics=metrics,
+                checks=checks,
             )
 
 
@@ -118,6 +126,31 @@ def test_a_signal_saves_and_the_run_goes_on_exactly(tmp_path: Path, uninterrupte
     assert int(final_state(tmp_path).step) == 5
     assert train(tmp_path) is None
     assert_same_run(tmp_path, uninterrupted)
+
+
+def test_a_signal_while_episodes_run_gives_them_up_and_saves(tmp_path: Path, uninterrupted: Path):
+    def evaluate(state: TrainState, stop: Callable[[], bool]) -> dict[str, float]:
+        assert not stop()
+        if int(state.step) == 5:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return {} if stop() else {"evaluation/success": 1 / int(state.step)}
+
+    checks = [loop.Check("evaluating", 1, evaluate)]
+    assert train(tmp_path, checks=checks) == signal.SIGTERM
+    with closing(RunCheckpoints(tmp_path, read_only=True)) as checkpoints:
+        assert (checkpoints.best_step, checkpoints.latest_step) == (1, 5)
+    assert train(tmp_path, checks=checks) is None
+    assert_same_run(tmp_path, uninterrupted)
+
+
+def test_success_comes_before_errors_of_answers_and_nan_is_no_score():
+    evaluated = {"evaluation/success": 0.25, "validation/position_cm": 9.0}
+    failed = {"evaluation/success": 0.0, "validation/position_cm": 0.1}
+    order = [{"evaluation/success": 0.5}, evaluated, failed, {"validation/position_cm": 0.1}]
+    scores = [loop.score_of(figures) for figures in order]
+    assert scores == sorted(scores, key=lambda score: score if score is not None else np.nan)
+    assert loop.score_of({"loss": 1.0}) is None
+    assert loop.score_of({"validation/position_cm": np.nan}) is None
 
 
 def test_a_death_between_checkpoints_leaves_no_trace(tmp_path: Path, uninterrupted: Path):

@@ -7,6 +7,7 @@ at each of them for the bins that are still possible after the tokens before it:
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -27,14 +28,14 @@ class NumberTargets:
     """The choices between tokens that an answer's bins consist of, R in all, row 0 standing for no such choice.
 
     tokens: int32 (U,), every token that some choice offers.
-    distances: float32 (R, U), the bins between a row's target and the nearest bin that each token leads to; infinite
-        for a token that the choice does not offer.
+    offsets: float32 (R, U), the bins from a row's target to the nearest bin that each token leads to; infinite for a
+        token that the choice does not offer.
     weights: float32 (R, U), the distribution to learn; None where it is one-hot.
     begins: bool (R,), True for the first choice of a number.
     """
 
     tokens: np.ndarray
-    distances: np.ndarray
+    offsets: np.ndarray
     weights: np.ndarray | None
     begins: np.ndarray
 
@@ -49,12 +50,22 @@ class NumberRows:
 
     def rows(self, integers: np.ndarray) -> np.ndarray:
         """Action integers (A, 8) -> int32 (L,), the row of each of the answer's tokens, its end included."""
+        return self._along(integers, lambda index, place: self._rows[len(integers)][index][place])
+
+    def numbers(self, integers: np.ndarray) -> np.ndarray:
+        """Action integers (A, 8) -> int32 (L,), which number each of the answer's tokens belongs to, 1 to 8 A; 0 for
+        those between numbers."""
+        slots = self._grammars[len(integers)].slots
+        return self._along(integers, lambda index, place: [index + 1] * len(slots[index].tokens[place]))
+
+    def _along(self, integers: np.ndarray, of_number: Callable[[int, int], list[int]]) -> np.ndarray:
+        """An answer's tokens with what `of_number` has for those of each number, by its slot and its place there."""
         grammar: AnswerGrammar = self._grammars[len(integers)]
-        rows = [0] * len(grammar.templates[0])
+        values = [0] * len(grammar.templates[0])
         for index, (slot, value) in enumerate(zip(grammar.slots, integers.ravel(), strict=True)):
-            rows += self._rows[len(integers)][index][value - slot.low]
-            rows += [0] * len(grammar.templates[index + 1])
-        return np.array(rows, np.int32)
+            values += of_number(index, value - slot.low)
+            values += [0] * len(grammar.templates[index + 1])
+        return np.array(values, np.int32)
 
     def targets(self, sigma: float) -> NumberTargets:
         """The rows' contents.
@@ -64,17 +75,17 @@ class NumberRows:
         """
         tokens = sorted({token for choices, _, _ in self._numbers for token, _ in choices})
         column = {token: index for index, token in enumerate(tokens)}
-        distances = np.full((len(self._numbers) + 1, len(tokens)), np.inf, np.float32)
-        weights = np.zeros_like(distances)
+        offsets = np.full((len(self._numbers) + 1, len(tokens)), np.inf, np.float32)
+        weights = np.zeros_like(offsets)
         for (choices, target, _), row in self._numbers.items():
             for token, values in choices:
-                away = np.abs(np.array(values, np.float64) - target)
-                distances[row, column[token]] = away.min()
+                away = np.array(values, np.float64) - target
+                offsets[row, column[token]] = away[np.abs(away).argmin()]
                 if sigma > 0:
                     weights[row, column[token]] = np.exp(-0.5 * (away / sigma) ** 2).sum()
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
         begins = np.array([False, *(begins for _, _, begins in self._numbers)])
-        return NumberTargets(np.array(tokens, np.int32), distances, weights if sigma > 0 else None, begins)
+        return NumberTargets(np.array(tokens, np.int32), offsets, weights if sigma > 0 else None, begins)
 
     def _slot_rows(self, slot: NumberSlot) -> list[list[int]]:
         if len(slot.tokens) <= _STATUS_VALUES:

@@ -28,11 +28,23 @@ class OptimizerConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class ValidationConfig:
+    """Comparison of answers with held-out demonstrations while training."""
+
+    episodes: int = 10
+    """Held-out demonstrations a task: from seeds of their own, or what a folder has after `data.episodes`."""
+    batches: int = 8
+    """At most so many, always the same ones; fewer where that is all of the demonstrations."""
+
+
+@dataclasses.dataclass(frozen=True)
 class EvaluationConfig:
     """Closed-loop evaluation on unseen episodes."""
 
     episodes: int = 25
-    """Unseen episodes a task."""
+    """Unseen episodes a task, for eval.py."""
+    episodes_while_training: int = 10
+    """Unseen episodes a task, every `evaluate_every` steps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +57,7 @@ class Experiment:
     oxe: OxeConfig | None = None
     """Open X-Embodiment episodes to learn from instead of `data`."""
     optimizer: OptimizerConfig = OptimizerConfig()
+    validation: ValidationConfig = ValidationConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     regime: Literal["full", "lora", "adapters"] = "full"
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
@@ -64,9 +77,13 @@ class Experiment:
     """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0
     log_every: int = 20
+    validate_every: int = 0
+    """Steps after which answers are compared with held-out demonstrations, and at the end; 0 for never."""
+    evaluate_every: int = 0
+    """Steps after which the policy acts in episodes of the training tasks, and at the end; 0 for never."""
     checkpoint_every: int = 250
     keep_checkpoints: int = 2
-    """The newest checkpoints that stay."""
+    """The newest checkpoints that stay, besides the best one where steps are validated or evaluated."""
     max_skipped_steps: int = 10
     """Steps whose loss or gradient is not finite are skipped; a run with more of them stops."""
 
@@ -83,7 +100,17 @@ class Experiment:
 
 
 # What may change when a run goes on: none of it changes what the run learns.
-FREE_TO_CHANGE = ("mesh", "evaluation", "log_every", "checkpoint_every", "keep_checkpoints", "max_skipped_steps")
+FREE_TO_CHANGE = (
+    "mesh",
+    "validation",
+    "evaluation",
+    "log_every",
+    "validate_every",
+    "evaluate_every",
+    "checkpoint_every",
+    "keep_checkpoints",
+    "max_skipped_steps",
+)
 
 
 def outcome_differences(one: Experiment, other: Experiment) -> list[str]:

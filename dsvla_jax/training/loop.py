@@ -1,8 +1,9 @@
 """The training loop: steps, numbers, checkpoints, and an end that loses nothing."""
 
 import dataclasses
+import math
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,6 +30,23 @@ class Batches(Protocol):
     def get_state(self) -> dict[str, Any]: ...
 
 
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """What is found out about a state every so many steps, and at the end; 0 for never.
+
+    doing: in a word, for people. look: gives figures by name; may ask its second argument whether to give up, and then
+    gives none.
+    """
+
+    doing: str
+    every: int
+    look: Callable[[TrainState, Callable[[], bool]], dict[str, float]]
+
+    def is_due(self, step: int, last: int) -> bool:
+        """Whether after this step."""
+        return self.every > 0 and (step % self.every == 0 or step == last)
+
+
 def train(
     experiment: Experiment,
     run: Path,
@@ -38,11 +56,13 @@ def train(
     batches: Batches,
     checkpoints: RunCheckpoints,
     metrics: MetricsWriter,
+    checks: Sequence[Check] = (),
     note: Callable[[str], None] = lambda doing: None,
 ) -> signal.Signals | None:
     """Trains from the state's step to the experiment's last, saving on the way and at the end.
 
     step: trains on this process's part of a batch; may consume the state that it is given.
+    checks: a step that their figures give a score (`score_of`) is saved, and its checkpoint carries the score.
     note: is told what is being done, in words that name the step.
     Returns the signal that asked to stop, None where training is finished. Either way the last step is on disk.
     Raises UserError where a checkpoint cannot be written, or too many steps were not finite.
@@ -67,23 +87,46 @@ def train(
                 clock.start()
             else:
                 clock.count(experiment.batch_size, int(batch["text_mask"].sum()) * jax.process_count())
-            stop = request.after(done)
-            last = done == experiment.steps or stop is not None
+            figures: dict[str, float] = {}
             if done % experiment.log_every == 0 or done == experiment.steps:
                 numbers = {name: float(value) for name, value in values.items()}
-                metrics.write(done, {**numbers, **clock.read(), **memory()})
+                figures = {**numbers, **clock.read(), **memory()}
                 bar.set_postfix_str(f"loss {numbers['loss']:.3f}, bins within one {numbers['bin_within_one']:.2f}")
                 checkpoints.raise_if_failed()
-            if done % experiment.checkpoint_every == 0 or last:
+            for check in checks:
+                # Whoever asks to stop is not kept waiting.
+                if check.is_due(done, experiment.steps) and not request.noted:
+                    note(f"{check.doing} step {done}")
+                    bar.set_postfix_str(check.doing)
+                    jax.block_until_ready(values)
+                    with clock.paused():
+                        figures |= check.look(state, lambda: request.noted)
+            if figures:
+                metrics.write(done, figures)
+            stop, score = request.after(done), score_of(figures)
+            last = done == experiment.steps or stop is not None
+            if done % experiment.checkpoint_every == 0 or last or score is not None:
                 skipped.settle()
                 metrics.sync()
                 with clock.paused():
-                    checkpoints.save(done, arrays_of(state), notes_of(experiment, batches))
+                    checkpoints.save(done, arrays_of(state), notes_of(experiment, batches), score)
             if stop is not None:
                 bar.set_postfix_str(f"{stop.name}: saving step {done}")
                 break
     checkpoints.wait()
     return stop if done < experiment.steps else None
+
+
+def score_of(figures: Mapping[str, float]) -> float | None:
+    """What the best checkpoint is chosen by, the lower the better; None where nothing says how good a step is.
+
+    Success in closed loop, turned round, or else the position error of answers: every step that was evaluated comes
+    before those that were only validated.
+    """
+    if "evaluation/success" in figures:
+        return -figures["evaluation/success"]
+    error = figures.get("validation/position_cm", math.nan)
+    return error if math.isfinite(error) else None
 
 
 def arrays_of(state: TrainState) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def answer_loss(
     loss = -jnp.where(answer, likelihood, 0.0).sum() / count
 
     guess = log_probabilities.argmax(-1)
-    near = (guess[..., None] == targets.tokens) & (jnp.asarray(targets.distances) <= 1)[rows]
+    near = (guess[..., None] == targets.tokens) & (jnp.abs(jnp.asarray(targets.offsets)) <= 1)[rows]
     far = chooses & ~near.any(-1)
     begins = jnp.asarray(targets.begins)[rows]
     # A number is far off if one of its tokens is: the first such token since its beginning counts.

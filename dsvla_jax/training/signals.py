@@ -39,6 +39,11 @@ class StopRequest:
             number, handler = self._previous.popitem()
             signal.signal(number, handler)  # pyright: ignore[reportArgumentType]
 
+    @property
+    def noted(self) -> bool:
+        """Whether a signal is known of before `after` says so; never with several processes, which have to agree."""
+        return self._received is not None and jax.process_count() == 1
+
     def after(self, step: int) -> signal.Signals | None:
         """The signal that asks to stop after this step, if any. To be asked once a step, by every process."""
         if jax.process_count() > 1 and multihost_utils.reached_preemption_sync_point(step):
