@@ -43,6 +43,7 @@ from dsvla_jax.training import loop
 from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes
 from dsvla_jax.training.experiment import Experiment, load_experiment, outcome_differences, save_experiment
 from dsvla_jax.training.metrics import MetricsWriter
+from dsvla_jax.training.profile import trace_steps
 from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch
 from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
@@ -53,7 +54,7 @@ from dsvla_jax.weights.base import is_imported, load_for_model
 PADDING_ROWS = 1024
 
 
-def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "") -> int:
+def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "", profile: int = 0) -> int:
     """Trains one experiment into the run folder, or goes on from its newest checkpoint. Returns the exit status."""
     tokenizer = tokenizer_of(experiment)
     if experiment.oxe is None:
@@ -71,7 +72,7 @@ def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "")
         if checkpoints.latest_step == experiment.steps:
             print(f"{run} has been trained to step {experiment.steps}: nothing to do")
             return 0
-        stopped = train(experiment, run, tokenizer, checkpoints, mesh, part, watchdog, wandb)
+        stopped = train(experiment, run, tokenizer, checkpoints, mesh, part, watchdog, wandb, profile)
         step_reached = checkpoints.latest_step
     if stopped is not None:
         print(f"{stopped.name}: {run} is saved at step {step_reached}; the same command goes on from there")
@@ -89,6 +90,7 @@ def train(
     part: BatchPart,
     watchdog: Watchdog,
     wandb: str,
+    profile: int,
 ) -> signal.Signals | None:
     """Trains from the newest checkpoint, or from the beginning. Returns the signal that stopped it, if one did."""
     batches, samples, displacement = open_data(experiment, tokenizer, part)
@@ -124,12 +126,15 @@ def train(
         loop.Check("validating", experiment.validate_every, validate),
         loop.Check("evaluating", experiment.evaluate_every, make_evaluation(experiment, tokenizer, frozen)),
     )
-    with MetricsWriter(run, int(state.step), wandb, dataclasses.asdict(experiment)) as metrics:
+    with (
+        MetricsWriter(run, int(state.step), wandb, dataclasses.asdict(experiment)) as metrics,
+        trace_steps(step, run / "profile", profile) as traced,
+    ):
         return loop.train(
             experiment,
             run,
             state=state,
-            step=step,
+            step=traced,
             batches=batches,
             checkpoints=checkpoints,
             metrics=metrics,
@@ -303,6 +308,7 @@ def command_line(arguments: list[str]) -> None:
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = experiment,
         run: Path = Path("runs") / name,
         wandb: str = "",
+        profile: int = 0,
     ) -> int:
         """Trains one experiment.
 
@@ -310,9 +316,10 @@ def command_line(arguments: list[str]) -> None:
             experiment: what to train; every field of the config can be overridden.
             run: the run folder; one that holds a run of the same config goes on from its newest checkpoint.
             wandb: the project of Weights & Biases to write metrics to as well.
+            profile: how many steps to trace into the run folder's `profile`, from the third step on.
         """
         with Watchdog(run / "processes").watching() as watchdog:
-            return main(experiment, run, watchdog, wandb)
+            return main(experiment, run, watchdog, wandb, profile)
 
     sys.exit(tyro.cli(train_run, args=rest, prog=f"train.py {name}", config=(tyro.conf.AvoidSubcommands,)))
 

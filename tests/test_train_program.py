@@ -1,0 +1,106 @@
+"""train.py as a process of its own: what a scheduler sees of it."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.episodes import EpisodeReader, write_episodes
+from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
+from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from tests.test_data import random_episode
+
+ROOT = Path(__file__).parent.parent
+
+
+# The smallest model that has every part.
+SMALL = """
+    tiny --run run --log-every 1 --batch-size 2 --encoding.image-size 32 --encoding.patch-size 16
+    --encoding.points.num-points 64 --encoding.points.group-sizes 16 4 --encoding.points.neighbours 4
+    --encoding.points.width 32 --model.vision.image-size 32 --model.vision.patch-size 16 --model.vision.width 32
+    --model.vision.layers 1 --model.vision.heads 2 --model.language.width 32 --model.language.layers 1
+    --model.language.heads 2 --model.language.kv-heads 2 --model.language.ffn 64 --model.scan-unroll 1
+"""
+
+
+def start(folder: Path, options: str) -> subprocess.Popen[str]:
+    """train.py in a folder, which gets what it says of errors and progress."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+    with (folder / "errors").open("w") as errors:
+        return subprocess.Popen(
+            [sys.executable, str(ROOT / "train.py"), *SMALL.split(), *options.split()],
+            cwd=folder,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+
+
+def write_recordings(folder: Path) -> str:
+    """Writes random recordings and their vocabulary; returns the options to learn from them."""
+    episodes = [random_episode(seed, size=32) for seed in range(4)]
+    write_episodes(folder / "data", episodes)
+    tokenizer = WordTokenizer(vocabulary(episode.instruction for episode in episodes))
+    (folder / "words").mkdir()
+    save_tokenizer(tokenizer, folder / "words")
+    return (
+        "--data.source episodes --data.folder data --data.tasks all --tokenizer words "
+        f"--model.language.vocab-size {tokenizer.vocab_size}"
+    )
+
+
+def lines_of(run: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_sigterm_saves_the_step_in_progress_and_ends_with_a_status_of_its_own(tmp_path: Path):
+    data = write_recordings(tmp_path)
+    with start(tmp_path, f"{data} --steps 1000000 --checkpoint-every 1000000 --profile 2") as process:
+        assert process.stdout is not None
+        printed = []
+        for line in process.stdout:
+            printed.append(line)
+            if line.startswith("trace: "):
+                process.send_signal(signal.SIGTERM)
+        process.wait(timeout=300)
+    run = tmp_path / "run"
+    assert process.returncode == 75, (tmp_path / "errors").read_text()
+    lines = lines_of(run)
+    with contextlib.closing(RunCheckpoints(run, read_only=True)) as checkpoints:
+        assert checkpoints.latest_step == lines[-1]["step"] == len(lines) >= 4
+    assert f"SIGTERM: run is saved at step {len(lines)}; the same command goes on from there" in printed[-1]
+    assert lines[-1]["model_tflops_per_second"] > 0
+    assert "model_flops_utilisation" not in lines[-1], "nobody publishes the peak of a CPU"
+    # The trace, for either of the viewers that its line names.
+    assert (
+        len(list((run / "profile").rglob("*.xplane.pb"))) == len(list((run / "profile").rglob("*.trace.json.gz"))) == 1
+    )
+
+
+@pytest.mark.slow
+def test_a_run_in_simulation_is_validated_and_evaluated_on_seeds_of_their_own(tmp_path: Path):
+    data = "--data.tasks lamp_on --data.episodes 4 --data.image-size 32 --validation.episodes 2"
+    checks = "--steps 4 --validate-every 2 --evaluate-every 4 --evaluation.episodes-while-training 2"
+    process = start(tmp_path, f"{data} {checks}")
+    process.communicate(timeout=900)
+    assert process.returncode == 0, (tmp_path / "errors").read_text()
+    validated = {
+        line["step"]: line["validation/position_cm"] for line in lines_of(tmp_path / "run") if "validation/loss" in line
+    }
+    assert list(validated) == [2, 4]
+    last = lines_of(tmp_path / "run")[-1]
+    assert last["evaluation/lamp_on"] == last["evaluation/success"] in (0, 0.5, 1)
+    training, held_out = (EpisodeReader(tmp_path / "data" / name) for name in ("demos", "demos_validation"))
+    assert (len(training), len(held_out)) == (4, 2)
+    assert held_out.settings["split"] == "validation"
+    pictures = {training.episode(number).rgb_png[0] for number in range(4)}
+    assert not pictures & {held_out.episode(number).rgb_png[0] for number in range(2)}
+    with contextlib.closing(RunCheckpoints(tmp_path / "run", read_only=True)) as checkpoints:
+        assert checkpoints.best_step == 4, "a step that was evaluated comes first"
