@@ -1,25 +1,36 @@
 """Trains a tiny model on virtual devices and prints its losses as JSON: python -m tests.sharded_training OPTIONS.
 
+With --run it goes on from the checkpoint there, whose digest it prints first; or writes it where there is none. With
+--validate it prints the figures of validation at the end.
+
 Tests start it in processes of its own, because the number of devices is fixed once JAX has started.
 """
 
+import contextlib
 import dataclasses
+import hashlib
 import json
 import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
+from jax.experimental import multihost_utils
 
+from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.training.experiment import Experiment, OptimizerConfig
+from dsvla_jax.training.loop import arrays_of, state_of
 from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.training.validation import jit_validation, mean_errors
 from tests.small import small_encoding, small_language, small_vision
 
 VOCABULARY = 40
@@ -72,8 +83,25 @@ def batches(experiment: Experiment) -> list[dict[str, np.ndarray]]:
     return [batch() for _ in range(3)]
 
 
-def train(experiment: Experiment, devices: int) -> list[float]:
-    """The losses of a run on the first so many devices (0: all)."""
+def digest(tree: Any) -> str:
+    """Of all values of a tree, wherever they live."""
+
+    def whole(leaf: Any) -> bytes:
+        values = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        return np.asarray(multihost_utils.process_allgather(values, tiled=True)).tobytes()
+
+    return hashlib.sha256(b"".join(map(whole, jax.tree.leaves(tree)))).hexdigest()
+
+
+def validation_batch(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The batch as if all its choices belonged to the first number of an answer, which is 2."""
+    integers = np.zeros((len(batch["rgb"]), 2, 8), np.int32)
+    integers[:, 0, 0] = 2
+    return {**batch, "integers": integers, "number_of": np.where(batch["number_rows"] > 0, 1, 0).astype(np.int32)}
+
+
+def train(experiment: Experiment, devices: int, run: Path | None, until: int, validates: bool) -> list[float]:
+    """The losses of a run on the first so many devices (0: all), up to a step."""
     mesh = make_mesh(experiment.mesh, jax.devices()[:devices] if devices else None)
     values = np.full(VOCABULARY, np.nan, np.float32)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
@@ -81,14 +109,30 @@ def train(experiment: Experiment, devices: int) -> list[float]:
     step = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, TARGETS), state, mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     mine = slice(part.index * part.size, (part.index + 1) * part.size)
-    data = [put_batch({key: value[mine] for key, value in batch.items()}, mesh) for batch in batches(experiment)]
+    parts = [{key: value[mine] for key, value in batch.items()} for batch in batches(experiment)]
+    data = [put_batch(batch, mesh) for batch in parts]
+    new = run is not None and not (run / "checkpoints").exists()
+    if run is not None and not new:
+        with contextlib.closing(RunCheckpoints(run, read_only=True)) as checkpoints:
+            frozen = checkpoints.restore_base(frozen)
+            state = state_of(checkpoints.restore(arrays_of(state)))
+        print("restored", digest((state, frozen)), flush=True)
     losses = []
-    for index in range(experiment.steps):
+    for index in range(int(state.step), until):
         before = state
         with jax.transfer_guard("disallow"):
             state, metrics = step(state, frozen, data[index % 3])
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(before)), "the state is donated to the step"
         losses.append(float(metrics["loss"]))
+    if new and run is not None:
+        with contextlib.closing(RunCheckpoints(run)) as checkpoints:
+            checkpoints.save_base(frozen)
+            checkpoints.save(until, arrays_of(state), {"iterator": {}, "config": {}})
+        print("saved", digest((state, frozen)), flush=True)
+    if validates:
+        sums = jit_validation(experiment, TARGETS, mesh)
+        figures = mean_errors(sums, state.trainable, frozen, map(validation_batch, parts), mesh)
+        print("validation", json.dumps(figures), flush=True)
     return losses
 
 
@@ -104,6 +148,9 @@ class Options:
     processes: int = 1
     fusion: str = "prefix"
     points: bool = False
+    run: Path | None = None
+    until: int = 20
+    validate: bool = False
 
 
 def main(options: Options) -> None:
@@ -112,7 +159,9 @@ def main(options: Options) -> None:
     for mesh, devices, parts in zip(options.meshes, options.devices, options.accumulation, strict=True):
         config = MeshConfig(*map(int, mesh.split(",")))
         experiment = tiny_experiment(options.fusion, options.points, mesh=config, gradient_accumulation=parts)
-        print("losses", json.dumps(train(experiment, devices)), flush=True)
+        print(
+            "losses", json.dumps(train(experiment, devices, options.run, options.until, options.validate)), flush=True
+        )
 
 
 if __name__ == "__main__":

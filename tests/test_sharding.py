@@ -47,10 +47,19 @@ def start(devices: int, *arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def losses(process: subprocess.Popen[str]) -> list[list[float]]:
+def told(process: subprocess.Popen[str]) -> dict[str, list[str]]:
+    """What the process printed, by the first word of each line."""
     output, errors = process.communicate(timeout=900)
     assert process.returncode == 0, errors
-    return [json.loads(line.removeprefix("losses ")) for line in output.splitlines() if line.startswith("losses ")]
+    lines: dict[str, list[str]] = {}
+    for line in output.splitlines():
+        word, _, rest = line.partition(" ")
+        lines.setdefault(word, []).append(rest)
+    return lines
+
+
+def losses(process: subprocess.Popen[str]) -> list[list[float]]:
+    return [json.loads(line) for line in told(process)["losses"]]
 
 
 def curves_on(runs: dict[str, tuple[str, int, int]], *more: str) -> dict[str, list[float]]:
@@ -67,11 +76,15 @@ def free_address() -> str:
         return f"127.0.0.1:{free.getsockname()[1]}"
 
 
+def two_processes(*more: str, mesh: str = "2,2,2", devices: int = 4) -> list[subprocess.Popen[str]]:
+    """Two processes of so many devices each."""
+    options = ["--meshes", mesh, "--devices", "0", "--accumulation", "1", "--coordinator", free_address(), *more]
+    return [start(devices, *options, "--process", str(index), "--processes", "2") for index in range(2)]
+
+
 def curves_of_processes(*more: str) -> list[list[float]]:
     """The losses that two processes of 4 devices each report."""
-    options = ["--meshes", "2,2,2", "--devices", "0", "--accumulation", "1", "--coordinator", free_address(), *more]
-    processes = [start(4, *options, "--process", str(index), "--processes", "2") for index in range(2)]
-    return [losses(process)[0] for process in processes]
+    return [losses(process)[0] for process in two_processes(*more)]
 
 
 def require_learning_alike(curve: list[float], expected: list[float]) -> None:
@@ -108,6 +121,33 @@ def test_losses_are_the_same_on_any_mesh(fusion):
     curves = curves_on(runs, *options)
     for curve in (*curves.values(), *curves_of_processes(*options)):
         require_learning_alike(curve, curves["one"])
+
+
+@pytest.mark.slow
+def test_a_checkpoint_of_eight_devices_goes_on_anywhere(one_device, tmp_path: Path):
+    run = ("--run", str(tmp_path))
+    whole = told(start(8, "--meshes", "2,2,2", "--devices", "0", "--accumulation", "1", *run, "--until", "10"))
+    first = json.loads(whole["losses"][0])
+    others = ("1,1,1", "1,2,1", "2,1,2")
+    options = ("--meshes", *others, "--devices", "1", "2", "4", "--accumulation", "1", "1", "1", *run)
+    reports = [told(start(8, *options)), *map(told, two_processes(*run, mesh="2,2,1", devices=2))]
+    assert [len(report["restored"]) for report in reports] == [3, 1, 1]
+    for report in reports:
+        assert set(report["restored"]) == set(whole["saved"]), "every value of state and base is the same"
+        for line in report["losses"]:
+            require_learning_alike([*first, *json.loads(line)], one_device["one"])
+
+
+@pytest.mark.slow
+def test_validation_says_the_same_on_any_mesh():
+    options = ("--until", "2", "--validate")
+    meshes = ("--meshes", "1,1,1", "2,2,2", "--devices", "1", "0", "--accumulation", "1", "1")
+    reports = [told(start(8, *meshes, *options)), *map(told, two_processes(*options))]
+    figures = [json.loads(line) for report in reports for line in report["validation"]]
+    assert len(figures) == 4
+    assert figures[0]["validation/loss"] > 0
+    for other in figures[1:]:
+        assert other == pytest.approx(figures[0], rel=1e-5)
 
 
 def bytes_on_each(tree: Any, mesh: Any) -> int:
