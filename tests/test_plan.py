@@ -92,6 +92,12 @@ def test_a_tpu_program_is_counted_by_its_loops():
     assert cost.traffic == 6 * (4 * weight + 4) + 2 * 4
 
 
+def test_a_loop_that_counts_by_more_than_one_runs_less_often():
+    raised = "%two = s32[]{:T(128)} constant(2)\n  %up = s32[]{:T(128)} add(%i, %two)\n  ROOT %next"
+    by_two = TPU_PROGRAM.replace("ROOT %next", raised).replace("tuple(%i, %w, %x)", "tuple(%up, %w, %x)")
+    assert program_cost(by_two).flops * 2 == program_cost(TPU_PROGRAM).flops
+
+
 def test_a_compiled_loop_of_products_is_counted_as_often_as_it_runs():
     def f(w, x):
         return jax.lax.scan(lambda x, w: (jnp.tanh(x @ w), None), x, w)[0]

@@ -270,24 +270,47 @@ def _trips(loop: Instruction, computation: Computation, computations: dict[str, 
     def at_start(side: Literal[0, 1]) -> int | None:
         if compare.operands[side] in known:
             return known[compare.operands[side]]
-        item = condition.get(sides[side] or "")
-        while item is not None and item.opcode in ("copy", "bitcast", "convert"):
-            item = condition.get(item.operands[0])
+        item = _through_copies(condition, sides[side])
         if item is None or item.opcode != "get-tuple-element":
             return _constant(item)
-        index = int(item.attribute(r"index=(\d+)") or 0)
         start = computation.get(loop.operands[0])
         if start is None or start.opcode != "tuple":
             return None
-        value = computation.get(start.operands[index])
-        while value is not None and value.opcode in ("copy", "bitcast", "convert"):
-            value = computation.get(value.operands[0])
-        return _constant(value)
+        return _constant(_through_copies(computation, start.operands[_place(item)]))
 
     first, last = at_start(0), at_start(1)
     if last is None:
         return None
-    return max(last - (first or 0), 0)
+    counter = _through_copies(condition, sides[0])
+    body = computations[loop.attribute(r"body=%?([\w.\-]+)") or ""]
+    step = 1 if counter is None or counter.opcode != "get-tuple-element" else _step(body, _place(counter))
+    return max(-(-(last - (first or 0)) // step), 0)
+
+
+def _step(body: Computation, place: int) -> int:
+    """By how much a loop's body raises the counter at a place of its tuple: unrolled loops by more than one."""
+    root = next(item for item in body.values() if item.root)
+    item = _through_copies(body, root.operands[place]) if root.opcode == "tuple" else None
+    total = 0
+    while item is not None and item.opcode == "add":
+        sides = [_through_copies(body, name) for name in item.operands]
+        raised = [value for value in map(_constant, sides) if value is not None]
+        if len(raised) != 1:
+            break
+        total += raised[0]
+        item = next(side for side in sides if _constant(side) is None)
+    return max(total, 1)
+
+
+def _place(item: Instruction) -> int:
+    return int(item.attribute(r"index=(\d+)") or 0)
+
+
+def _through_copies(computation: Computation, name: str | None) -> Instruction | None:
+    item = computation.get(name or "")
+    while item is not None and item.opcode in ("copy", "bitcast", "convert"):
+        item = computation.get(item.operands[0])
+    return item
 
 
 def _constant(item: Instruction | None) -> int | None:
