@@ -3,8 +3,9 @@
 A product of (m, k) with (k, n) is 2 m k n. Training counts, for every product of the network, the forward pass; the
 gradient of its input; the gradient of its weight only where the weight learns; and with rematerialisation the forward
 pass again, without each block's last product, whose result nothing in the backward pass reads. Attention counts all
-pairs, as the program computes them, and not only those that a causal mask leaves. What comes before the first weight
-that learns (patches) has a forward pass only.
+pairs, as the program computes them, and not only those that a causal mask leaves. An adapter is two thin
+products, also where float32 training forms its sum with the matrix instead (`model.lora.adapted_product`). What comes
+before the first weight that learns (patches) has a forward pass only.
 """
 
 import dataclasses
