@@ -151,6 +151,13 @@ DAMAGE = {
         "steps/observation/base_pose_tool_reached: expected finite numbers, got 1 NaN or infinite, the first at step 1",
         5,
     ),
+    "stretched rotation": (
+        "viola",
+        in_record(set_number("steps/observation/ee_states", 16 * 3 + 5, 9.0)),
+        RECORD,
+        "pose: expected rotations, got another matrix at step 3",
+        5,
+    ),
     "no steps": (STRETCH, in_record(without_steps), RECORD, "steps: expected more than 0, got 0", 5),
     "missing picture": (
         STRETCH,

@@ -209,12 +209,20 @@ _ROTATION_SIZE = {"rpy": 3, "ypr": 3, "zxy": 3, "xyzw": 4, "wxyz": 4, "rotvec": 
 
 
 def _pose_matrix(matrix: np.ndarray, episode: RldsEpisode) -> np.ndarray:
-    end = np.array([0.0, 0.0, 0.0, 1.0])
+    end, fix = np.array([0.0, 0.0, 0.0, 1.0]), "is this the right dataset? Or leave the episode out with --skip-bad"
     for candidate in (matrix, matrix.transpose(0, 2, 1)):
         if np.allclose(candidate[:, 3], end, atol=1e-3):
-            return candidate
-    got = np.array2string(matrix[0, 3], precision=3)
-    raise DataError(episode.where, "pose", "a 4 x 4 pose ending in 0 0 0 1", got, "is this the right dataset?")
+            break
+    else:
+        got = np.array2string(matrix[0, 3], precision=3)
+        raise DataError(episode.where, "pose", "a 4 x 4 pose ending in 0 0 0 1", got, fix)
+    turned = candidate[:, :3, :3]
+    # Neither stretched nor mirrored, to what rounding and a controller's drift leave.
+    off = np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero((off > 0.05) | (np.linalg.det(turned) < 0))
+    if len(wrong):
+        raise DataError(episode.where, "pose", "rotations", f"another matrix at step {wrong[0]}", fix)
+    return candidate
 
 
 def displacement(start: np.ndarray, end: np.ndarray) -> np.ndarray:
