@@ -1,4 +1,4 @@
-"""The closed loop on the device gives the host loop's episodes on two tasks; episodes/s of both by batch (1 hour).
+"""The closed loop on the device gives the host loop's episodes on two tasks; episodes/s of both by batch (20 minutes).
 
 Usage: python -m benchmarks.device_loop [RUN] [--tasks lamp_on put_rubbish_in_bin] [--batches 4 16]
 
