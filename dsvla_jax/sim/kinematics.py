@@ -3,7 +3,8 @@
 The chain is ``robot.py``'s. Poses are [x, y, z, qx, qy, qz, qw] of the tool centre point in the world frame.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,9 +57,12 @@ class Chain(NamedTuple):
     position: Array
 
 
-def _combine(columns: tuple[Array, Array, Array], weights: np.ndarray) -> Array | float:
-    """The sum of three vectors times constants (3,). Written out because most are 0 or 1, and because products of 3x3
-    matrices one by one cost a CPU more in calls than in arithmetic."""
+def _combine(columns: Sequence[Array], weights: np.ndarray) -> Any:
+    """The sum of three vectors times constants (3,), or 0 if all of these are.
+
+    Written out because most are 0 or 1, and because products of 3x3 matrices one by one cost a CPU more in calls than
+    in arithmetic.
+    """
     return sum(column if w == 1 else column * np.float32(w) for column, w in zip(columns, weights, strict=True) if w)
 
 
