@@ -173,7 +173,9 @@ def test_the_best_of_several_samples_is_kept(variables):
     prompts, key = make_prompts(), jax.random.key(3)
     one = decoder(CONFIG, WHOLE, Decoding("sample"))(variables, prompts, key)
     best = decoder(CONFIG, WHOLE, Decoding("sample", samples=20))(variables, prompts, key)
-    assert (best.log_probs.sum((1, 2)) > one.log_probs.sum((1, 2))).all()
+    gained = best.log_probs.sum((1, 2)) - one.log_probs.sum((1, 2))
+    assert (gained > -1e-4).all(), "at worst the same answer, but for rounding"
+    assert (gained > 1).any()
     assert best.integers.shape == one.integers.shape
 
 
