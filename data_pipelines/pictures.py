@@ -9,6 +9,9 @@ import numpy as np
 
 Box = tuple[int, int, int, int]
 
+# Shares of red, green and blue in grey (ITU-R BT.601).
+GREY = np.array([0.299, 0.587, 0.114])
+
 
 def random_box(rng: np.random.Generator, height: int, width: int, smallest: float) -> Box:
     """A box with the picture's own proportions, of `smallest` to all of its sides, anywhere inside."""
@@ -47,8 +50,7 @@ def vary_light(
 ) -> np.ndarray:
     """uint8 (H, W, 3) with brightness, contrast and saturation varied by up to ±strength; into `out` if given."""
     brightness, contrast, saturation = 1 + rng.uniform(-strength, strength, 3)
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     # All three are linear: (s v + (1 - s) grey) b, moved away from or towards the mean grey by the contrast.
-    gain, mean = brightness * contrast, cv2.mean(grey)[0] * brightness
-    grey = cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)
-    return cv2.addWeighted(picture, saturation * gain, grey, (1 - saturation) * gain, mean * (1 - contrast), out)
+    gain, mean = brightness * contrast, np.dot(GREY, cv2.mean(picture)[:3]) * brightness
+    colours = gain * (saturation * np.eye(3) + (1 - saturation) * GREY)
+    return cv2.transform(picture, np.column_stack([colours, np.full(3, mean * (1 - contrast))]), out)

@@ -18,7 +18,7 @@ from data_pipelines.oxe.index import main_view
 from data_pipelines.oxe.mixture import EncodedSample, OpenDataset, folder_of, open_mixture, shares_of
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import DATASETS, get_dataset
-from data_pipelines.oxe.samples import prompt_and_answer, write_picture
+from data_pipelines.oxe.samples import prompts_and_answers, write_picture
 from data_pipelines.oxe.scale import HIGH, LOW, MixtureScale
 from data_pipelines.oxe.targets import why_unsupported
 from data_pipelines.records import DataError, Frame
@@ -172,7 +172,7 @@ def _section(
         drawn += draw_clouds(frames[0])
     lines = []
     for i in chosen:
-        prompt, answer, _ = prompt_and_answer(samples[i], encoding, scale)
+        ((prompt, answer, _),) = prompts_and_answers([samples[i]], encoding, scale)
         lines += [prompt, f"    {answer}"]
     heading = f"{episode.where}: “{samples[0].instruction}”"
     return Section(heading, drawn, lines), frames[0] if samples[0].camera is not None else None
