@@ -24,6 +24,7 @@ from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
+from dsvla_jax.model.layers_apart import take_apart
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
@@ -83,6 +84,7 @@ class Policy:
 
     config: PolicyConfig
     variables: Variables
+    """The model's, or these from `take_apart`."""
     tokenizer: Tokenizer
     decoding: Decoding = GREEDY
 
@@ -192,4 +194,6 @@ def load(
         like = jax.tree.map(lambda leaf, where: leaf.update(sharding=where), like, shardings(like, mesh))
     with contextlib.closing(RunCheckpoints(run, read_only=True)) as checkpoints:
         variables = checkpoints.restore_variables(like, step)
+    if mesh is None and jax.default_backend() == "cpu":
+        variables = take_apart(variables)
     return Policy(config, variables, tokenizer, decoding)

@@ -84,9 +84,7 @@ def prompts_and_answers(
     return [texts[place] for place in range(len(frames))]
 
 
-def targets_of(
-    frames: Sequence[EncodedSample], encoding: EncodingConfig, scale: MixtureScale | None
-) -> np.ndarray:
+def targets_of(frames: Sequence[EncodedSample], encoding: EncodingConfig, scale: MixtureScale | None) -> np.ndarray:
     """(N, A, 7) of frames of as many arms: the target poses, or the displacements as poses inside the codec's box."""
     if scale is None:
         return np.array([frame.target_pose for frame in frames])

@@ -18,6 +18,7 @@ from flax import struct
 
 from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
 from dsvla_jax.encoding.grammar import AnswerGrammar
+from dsvla_jax.model.layers_apart import is_apart, put_together
 from dsvla_jax.model.llama import KVCache
 from dsvla_jax.model.number_tree import (
     Branches,
@@ -118,6 +119,7 @@ def decode_actions(
 ) -> Decoded:
     """The answers of a batch. Under ``jax.jit``, close over the model, grammar and decoding (see ``make_decoder``).
 
+    variables: of the model, or these from `take_apart`.
     inputs: batched, the text being prompts without answers, padded at the end to one length; padding and the other
         examples of the batch have no influence on an answer.
     key: for `sample`; an example draws by its place in the batch.
@@ -125,6 +127,9 @@ def decode_actions(
     _check_vocabulary(grammar, model.config.language.vocab_size)
     if decoding.choice == "sample" and key is None:
         raise ValueError("decode_actions: choice 'sample' draws integers; give it a key")
+    if is_apart(variables):
+        layers = max(model.config.vision.layers, model.config.language.layers)
+        model = VLA(dataclasses.replace(model.config, scan_unroll=layers))
     trees = [number_tree(slot) for slot in grammar.slots]
     # What precedes the first number is read with the prompt; behind the last number nothing is read.
     inputs = _append(inputs, np.array(grammar.templates[0], np.int32))
@@ -134,7 +139,7 @@ def decode_actions(
     offsets = np.cumsum([0, *kept])
     room = max(offset + len(tree.branches.tokens) for offset, tree in zip(offsets, trees, strict=True))
 
-    prefilled: Any = model.apply(variables, inputs, int(room), method="prefill")
+    prefilled: Any = model.apply(put_together(variables), inputs, int(room), method="prefill")
     root, cache = prefilled
     before = cache.keys.shape[3] - room
     lengths = before - inputs.text_tokens.shape[1] + inputs.text_mask.sum(axis=1).astype(jnp.int32)
@@ -146,7 +151,7 @@ def decode_actions(
     written = _Written(*(jnp.zeros((batch, len(trees)), dtype) for dtype in (jnp.int32, jnp.float32, jnp.float32)))
 
     def choose(written: _Written, slot: int | Array, hidden: Array, tree: NumberTree) -> _Written:
-        logits: Any = model.apply(variables, hidden, tree.choices.tokens, method="lm_head")
+        logits: Any = model.apply(put_together(variables), hidden, tree.choices.tokens, method="lm_head")
         log_probs = _admitted(log_probabilities(logits, tree.choices), written, slot, tree.numbers)
         index = _choose(log_probs, tree.numbers, decoding, keys, slot)[:, None]
         entropy = -jnp.where(jnp.isfinite(log_probs), jnp.exp(log_probs) * log_probs, 0.0).sum(axis=-1)
@@ -230,7 +235,7 @@ def _extend(
     mask = jnp.broadcast_to(read.valid[:, None], (*tokens.shape, read.valid.shape[1]))
     mask = jax.lax.dynamic_update_slice_in_dim(mask, among, index, axis=2)
     extended: Any = model.apply(
-        variables, tokens, read.lengths[:, None] + behind, mask, read.cache, index, method="extend"
+        put_together(variables), tokens, read.lengths[:, None] + behind, mask, read.cache, index, method="extend"
     )
     x, cache = extended
     valid = jax.lax.dynamic_update_slice_in_dim(read.valid, counts, index, axis=1)
