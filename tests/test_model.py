@@ -152,18 +152,18 @@ def test_attention_equals_loops_in_numpy():
 def test_rotation_is_relative_and_pairs_halves():
     language = CONFIG.language
     rng = np.random.default_rng(0)
-    query, key = (jnp.asarray(rng.normal(size=(1, 1, 1, 8)), jnp.float32) for _ in range(2))
+    query, key = (jnp.asarray(rng.normal(size=(1, 1, 8)), jnp.float32) for _ in range(2))
 
     def product(p, q):
-        tables = [rotary_tables(jnp.array([[n]]), language) for n in (p, q)]
+        tables = [rotary_tables(jnp.array([[n]]), language, 15) for n in (p, q)]
         return (rotate(query, tables[0]) * rotate(key, tables[1])).sum()
 
     np.testing.assert_allclose(product(7, 3), product(14, 10), atol=1e-5)
     assert abs(product(7, 3) - product(7, 4)) > 1e-4
     # The slowest pair of a head of 8 is (3, 7), at theta^(-3/4).
-    basis = jnp.zeros((1, 1, 1, 8)).at[..., 3].set(1.0)
+    basis = jnp.zeros((1, 1, 8)).at[..., 3].set(1.0)
     angle = 100 * 10000.0**-0.75
-    rotated = rotate(basis, rotary_tables(jnp.array([[100]]), language))[0, 0, 0]
+    rotated = rotate(basis, rotary_tables(jnp.array([[100]]), language, 101))[0, 0]
     np.testing.assert_allclose(rotated[jnp.array([3, 7])], [np.cos(angle), np.sin(angle)], atol=1e-5)
 
 

@@ -93,17 +93,21 @@ def rotary_frequencies(config: LanguageConfig) -> np.ndarray:
     return frequencies.astype(np.float32)
 
 
-def rotary_tables(positions: Array, config: LanguageConfig) -> tuple[Array, Array]:
-    """Positions int32 (B, T) -> cosines and sines, float32 (B, 1, T, D / 2)."""
-    angles = positions[:, None, :, None].astype(jnp.float32) * rotary_frequencies(config)
-    return jnp.cos(angles), jnp.sin(angles)
+def rotary_tables(positions: Array, config: LanguageConfig, length: int) -> tuple[Array, Array]:
+    """Positions int32 (B, T), all below ``length``, -> cosines and sines, float32 (B, T, 1, D / 2)."""
+    # Read from constants: XLA would work every cosine out again for each layer, head and example, where it is used.
+    angles = np.arange(length, dtype=np.float32)[:, None] * rotary_frequencies(config)
+    cosine, sine = (jnp.asarray(table)[positions][:, :, None] for table in (np.cos(angles), np.sin(angles)))
+    return cosine, sine
 
 
 def rotate(x: Array, tables: tuple[Array, Array]) -> Array:
-    """Rotate the pairs (x[i], x[i + D/2]) of (B, H, T, D) by their position's angle, in float32."""
+    """Rotate the pairs (x[i], x[i + D/2]) of each head of (B, T, heads * D) by their position's angle, in float32."""
     cosine, sine = tables
-    first, second = jnp.split(x.astype(jnp.float32), 2, axis=-1)
-    return jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1).astype(x.dtype)
+    heads = x.reshape(*x.shape[:2], -1, 2 * cosine.shape[-1]).astype(jnp.float32)
+    first, second = jnp.split(heads, 2, axis=-1)
+    rotated = jnp.concatenate([first * cosine - second * sine, second * cosine + first * sine], axis=-1)
+    return rotated.astype(x.dtype).reshape(x.shape)
 
 
 class DecoderBlock(nn.Module):
@@ -138,9 +142,10 @@ class DecoderBlock(nn.Module):
         query_width, kv_width = language.heads * language.head_dim, language.kv_heads * language.head_dim
 
         y = RMSNorm(language.norm_eps, name="attention_norm")(x)
-        query = rotate(split_heads(linear("q", query_width)(y), language.heads), tables)
+        # Rotated before the heads are split: rotating what is transposed is slow on a CPU, and so is its gradient.
+        query = split_heads(rotate(linear("q", query_width)(y), tables), language.heads)
         to_key, to_value = (linear(name, kv_width) for name in "kv")
-        key = rotate(split_heads(to_key(y), language.kv_heads), tables)
+        key = split_heads(rotate(to_key(y), tables), language.kv_heads)
         value = split_heads(to_value(y), language.kv_heads)
         if cache is not None:
             key = jax.lax.dynamic_update_slice_in_dim(cache.keys, key, index, axis=2)
@@ -206,12 +211,12 @@ class Llama(nn.Module):
         index: Array | int = 0,
         prompts: tuple[PromptTokens, LayerPrompts] | None = None,
     ) -> tuple[Array, KVCache | None]:
-        """x (B, T, width), positions int32 (B or 1, T), mask bool (B or 1, T, S) -> hidden (B, T, width), new cache.
+        """x (B, T, width), positions int32 (B or 1, T) below S, mask bool (B or 1, T, S) -> hidden (B, T, width), new cache.
 
         Without a cache S is T. With one, its S slots are attended to, after slots index..index+T-1 are overwritten.
         prompts: the visual prompts, which also go into the cache; later calls find them there and need none.
         """
-        tables = rotary_tables(positions, self.config.language)
+        tables = rotary_tables(positions, self.config.language, mask.shape[-1])
         shared, layer_prompts = prompts or (None, None)
         if cache is None or cache.prompt is None:
             x, cache = self.layers(x, tables, mask, cache, index, shared, layer_prompts)

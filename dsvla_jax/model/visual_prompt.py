@@ -58,19 +58,19 @@ class VisualPrompt(nn.Module):
         row_count = 1 + self.config.vision.num_patches
         rows = jnp.broadcast_to(jnp.arange(row_count), (batch, row_count))
         rows = jnp.concatenate([rows, 1 + point_patches], axis=1)
-        positions = rows
+        positions, length = rows, row_count
         if prompt.queries:
             row_count = prompt.queries
             queries = self.param("visual_query", nn.initializers.normal(1.0), (row_count, prompt.width))
             queries = jnp.broadcast_to(queries.astype(dtype), (batch, *queries.shape))
             x = jnp.concatenate([queries, x], axis=1)
             rows = jnp.broadcast_to(jnp.arange(row_count), (batch, row_count))
-            positions = jnp.concatenate([rows, row_count + positions], axis=1)
+            positions, length = jnp.concatenate([rows, row_count + positions], axis=1), row_count + length
 
         blocks = visual_blocks_config(self.config)
         in_axes = (nn.broadcast, nn.broadcast)
         layers = over_layers(DecoderBlock, blocks, prompt.layers, in_axes)(blocks, name="visual_blocks")
-        x, _ = layers(x, rotary_tables(positions, blocks.language), None)
+        x, _ = layers(x, rotary_tables(positions, blocks.language, length), None)
         x = RMSNorm(prompt.norm_eps, name="visual_blocks_norm")(x[:, : rows.shape[1]])
         x = LoraDense(prompt.width, name="visual_blocks_output", dtype=dtype)(x)
         x = LoraDense(language.width, name="visual_proj", **with_bias)(x)
