@@ -63,14 +63,18 @@ class VisionBlock(nn.Module):
         return x, None
 
 
+def rematerialised(block, config: ModelConfig) -> Any:
+    """``block`` as the config says that its backward pass is to be done."""
+    if config.remat == "none":
+        return block
+    name = REMAT_POLICIES.get(config.remat, config.remat)
+    return nn.remat(block, prevent_cse=False, policy=getattr(jax.checkpoint_policies, name))
+
+
 def over_layers(block, config: ModelConfig, layers: int, in_axes: Any = nn.broadcast) -> Any:
     """``block`` scanned over ``layers``: its variables get a leading layers axis; rematerialised as the config says."""
-    if config.remat != "none":
-        name = REMAT_POLICIES.get(config.remat, config.remat)
-        policy = getattr(jax.checkpoint_policies, name)
-        block = nn.remat(block, prevent_cse=False, policy=policy)
     return nn.scan(
-        block,
+        rematerialised(block, config),
         variable_axes={"params": 0, "lora": 0},
         split_rngs={"params": True},
         in_axes=in_axes,

@@ -205,7 +205,8 @@ class ModelConfig:
     attention: "by_hand" (two batched products over head-major arrays; the quickest on CPU), "fused"
         (jax.nn.dot_product_attention as XLA compiles it), "cudnn" (the same as one kernel of cuDNN's: NVIDIA, bfloat16,
         and cuDNN's limits on lengths), or "auto": "by_hand" on a CPU, "fused" elsewhere.
-    scan_unroll: layers per iteration of the loop over layers. Compile time grows with it, loop overhead shrinks.
+    scan_unroll: layers per iteration of the loop over layers. Compile time grows with it, loop overhead shrinks. With
+        as many as the language model has, training also leaves out what its last layer would do for visual tokens.
     """
 
     vision: VisionConfig = VisionConfig()

@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 
 from dsvla_jax.model.attention import attend, join_heads, split_heads
-from dsvla_jax.model.clip import over_layers
+from dsvla_jax.model.clip import over_layers, rematerialised
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.lora import LoraDense, residual_init
 from dsvla_jax.model.partition import constrain
@@ -116,9 +116,12 @@ class DecoderBlock(nn.Module):
     With a visual prompt the queries look at that too, in an attention with a softmax of its own, whose output is added
     behind the gate tanh(g) of each head (Zhang et al. 2023, "LLaMA-Adapter"). A prompt's keys and values are products
     with the base weights alone: no adapter, no norm, no rotation.
+
+    Only the positions from ``first_row`` on are queries, and have an output.
     """
 
     config: ModelConfig
+    first_row: int = 0
 
     @nn.compact
     def __call__(
@@ -143,7 +146,8 @@ class DecoderBlock(nn.Module):
 
         y = RMSNorm(language.norm_eps, name="attention_norm")(x)
         # Rotated before the heads are split: rotating what is transposed is slow on a CPU, and so is its gradient.
-        query = split_heads(rotate(linear("q", query_width)(y), tables), language.heads)
+        x, query, query_tables = jax.tree.map(lambda rows: rows[:, self.first_row :], (x, y, tables))
+        query = split_heads(rotate(linear("q", query_width)(query), query_tables), language.heads)
         to_key, to_value = (linear(name, kv_width) for name in "kv")
         key = split_heads(rotate(to_key(y), tables), language.kv_heads)
         value = split_heads(to_value(y), language.kv_heads)
@@ -151,6 +155,7 @@ class DecoderBlock(nn.Module):
             key = jax.lax.dynamic_update_slice_in_dim(cache.keys, key, index, axis=2)
             value = jax.lax.dynamic_update_slice_in_dim(cache.values, value, index, axis=2)
             cache = KVCache(key, value)
+        mask = None if mask is None else mask[:, self.first_row :]
         attended = attend(query, key, value, mask, self.config.attention)
         if shared is not None and isinstance(prompt, LayerPrompts):
             tokens = shared.tokens + constrain(constrain(prompt.rows.astype(dtype))[shared.rows], "batch")
@@ -210,22 +215,45 @@ class Llama(nn.Module):
         cache: KVCache | None = None,
         index: Array | int = 0,
         prompts: tuple[PromptTokens, LayerPrompts] | None = None,
+        first_row: int = 0,
     ) -> tuple[Array, KVCache | None]:
-        """x (B, T, width), positions int32 (B or 1, T) below S, mask bool (B or 1, T, S) -> hidden (B, T, width), new cache.
+        """x (B, T, width), positions int32 (B or 1, T) below S, mask bool (B or 1, T, S) -> hidden states, new cache.
+
+        The hidden states are those from ``first_row`` on, (B, T - first_row, width).
 
         Without a cache S is T. With one, its S slots are attended to, after slots index..index+T-1 are overwritten.
         prompts: the visual prompts, which also go into the cache; later calls find them there and need none.
         """
         tables = rotary_tables(positions, self.config.language, mask.shape[-1])
         shared, layer_prompts = prompts or (None, None)
-        if cache is None or cache.prompt is None:
+        unrolled = self.config.scan_unroll >= self.config.language.layers
+        if first_row and unrolled and cache is None and prompts is None and not self.is_initializing():
+            x, first_row = self._unrolled(x, tables, mask, first_row), 0
+        elif cache is None or cache.prompt is None:
             x, cache = self.layers(x, tables, mask, cache, index, shared, layer_prompts)
         else:
             # The prompt goes beside the cache and not in it, so that the loop over layers does not write it anew.
             cached = cache.prompt
             x, text = self.layers(x, tables, mask, cache.replace(prompt=None), index, None, cached)
             cache = KVCache(text.keys, text.values, cached)
-        return self.norm(x).astype(self.config.compute_dtype), cache
+        return self.norm(x[:, first_row:]).astype(self.config.compute_dtype), cache
+
+    def _unrolled(self, x: Array, tables: tuple[Array, Array], mask: Array, first_row: int) -> Array:
+        """All layers, the last one for the rows from ``first_row`` on alone: nobody reads its other outputs.
+
+        A loop over stacked layers cannot do that; unrolled, they need no such loop.
+        """
+        layers = self.config.language.layers
+        # Not indexed, because the gradient of `split` puts the layers' gradients side by side and adds up nothing.
+        leaves, structure = jax.tree.flatten(self.layers.variables)
+        parts = [jax.lax.split(leaf, (1,) * layers) for leaf in leaves]
+        for layer in range(layers):
+            variables = structure.unflatten([part[layer].squeeze(0) for part in parts])
+            block = rematerialised(DecoderBlock, self.config)
+            x, _ = block(self.config, first_row if layer == layers - 1 else 0, parent=None).apply(
+                variables, x, tables, mask
+            )
+        return x
 
     def lm_head(self, hidden: Array, tokens: np.ndarray | Array | None = None) -> Array:
         """(..., width) -> float32 logits (..., V), or those of ``tokens`` (U,) alone, (..., U)."""

@@ -48,8 +48,8 @@ class VLA(nn.Module):
         """Hidden states (B, T - text_from, width) of the text positions from ``text_from`` on."""
         x, positions, prompts = self._sequence(inputs)
         mask = positions[:, :, None] >= positions[:, None, :]
-        x, _ = self.language(x, positions, mask, prompts=prompts)
-        return x[:, x.shape[1] - inputs.text_tokens.shape[1] + text_from :]
+        first_row = x.shape[1] - inputs.text_tokens.shape[1] + text_from
+        return self.language(x, positions, mask, prompts=prompts, first_row=first_row)[0]
 
     def lm_head(self, hidden: Array, tokens: np.ndarray | Array | None = None) -> Array:
         """(..., width) -> float32 (..., V), or the logits of some ``tokens`` only.
