@@ -9,7 +9,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -33,7 +32,7 @@ from dsvla_jax.report import (
     write_results,
 )
 from dsvla_jax.rollout import Ending, run_task
-from dsvla_jax.rollout_keypoints import SegmentationKeypoints
+from dsvla_jax.rollout_keypoints import Keypoints, keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.shifts import check_shifts
 from dsvla_jax.sim.tasks import select_tasks
@@ -54,10 +53,11 @@ class Options:
     """Unseen episodes a task; the config's number if not given."""
     batch: int = 100
     """Most episodes side by side."""
-    keypoints: Literal["oracle", "segmentation", "segmentation-refresh"] = "oracle"
-    """What the policy is told to go near: the task's own points as they are at the start (oracle); those found in the
-    first picture, by the simulator's masks and the depth on them (segmentation; paper, section 3.3); or those found in
-    the picture before every key pose, hidden objects where they were last seen (segmentation-refresh)."""
+    keypoints: Keypoints | None = None
+    """What the policy is told to go near, as in its training if not given: the task's own points as they are at the
+    start (oracle); those found in the first picture, by the simulator's masks and the depth on them (segmentation;
+    paper, section 3.3); or those found in the picture before every key pose, hidden objects where they were last seen
+    (segmentation-refresh)."""
     keypoint_noise: float = 0.0
     """Metres of uniform noise an axis on every keypoint (paper, section 4.3: up to 0.1)."""
     shift: tuple[str, ...] = ()
@@ -75,11 +75,11 @@ def main(options: Options) -> None:
     """Evaluates, prints the table, writes results and report."""
     if options.compare:
         runs = (options.run, *options.compare)
-        print_comparison({str(run): read_results(results_file(run, options)) for run in runs})
+        files = {run: results_file(run, with_keypoints(options, load_run(run))) for run in runs}
+        print_comparison({str(run): read_results(file) for run, file in files.items()})
         return
-    if not (options.run / "config.json").exists():
-        raise UserError(f"{options.run}: no run here (config.json is missing); train one: python train.py CONFIG")
-    experiment = load_experiment(options.run / "config.json")
+    experiment = load_run(options.run)
+    options = with_keypoints(options, experiment)
     tasks = select_tasks(options.tasks or experiment.data.tasks)
     episodes = options.episodes or experiment.evaluation.episodes
     file = results_file(options.run, options)
@@ -109,9 +109,21 @@ def main(options: Options) -> None:
     print(f"report: {report}")
 
 
+def load_run(run: Path) -> Experiment:
+    """What was trained there. Raises UserError where nothing was."""
+    if not (run / "config.json").exists():
+        raise UserError(f"{run}: no run here (config.json is missing); train one: python train.py CONFIG")
+    return load_experiment(run / "config.json")
+
+
+def with_keypoints(options: Options, experiment: Experiment) -> Options:
+    """With the kind of keypoints that the run learned from, where the options name none."""
+    return dataclasses.replace(options, keypoints=options.keypoints or experiment.keypoints)
+
+
 def results_file(run: Path, options: Options) -> Path:
     """Where the results of these conditions are kept; the physics alone name the plain ones."""
-    keypoints = f"-{options.keypoints}" if options.keypoints != "oracle" else ""
+    keypoints = f"-{options.keypoints}" if options.keypoints not in (None, "oracle") else ""
     noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
     shifts = "".join(f"-{name}" for name in check_shifts(options.shift))
     choice = f"-{options.choice}" if options.choice != "greedy" else ""
@@ -138,9 +150,6 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
     environment = Environment(
         name, physics=options.physics, image_size=experiment.data.image_size, shifts=options.shift
     )
-    found = None
-    if options.keypoints != "oracle":
-        found = partial(SegmentationKeypoints, environment, refresh=options.keypoints == "segmentation-refresh")
     return run_task(
         environment,
         policy.act,
@@ -149,7 +158,7 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
         seed=options.seed,
         batch=options.batch,
         keypoint_noise=options.keypoint_noise,
-        find_keypoints=found,
+        find_keypoints=keypoint_source(options.keypoints or "oracle", environment),
         label=f"{name} ({options.physics})",
     )
 

@@ -37,6 +37,7 @@ from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
 from dsvla_jax.rollout import Stopped, run_task
+from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training import loop
@@ -208,6 +209,7 @@ def make_evaluation(
                     experiment.evaluation.episodes_while_training,
                     split="validation",
                     seed=experiment.data.seed,
+                    find_keypoints=keypoint_source(experiment.keypoints, environments[name]),
                     stop=stop,
                 )
             except Stopped:

@@ -29,7 +29,9 @@ from data_pipelines.records import Episode, make_episode, mark_missing
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.errors import UserError
+from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.types import Action
@@ -55,6 +57,9 @@ class Settings:
     with the expert's next key pose as the target."""
     perturb_probability: float = 0.5
     """How often a key pose is missed on purpose."""
+    keypoints: Literal["oracle", "segmentation"] = "oracle"
+    """The task's own points, or those found in the first picture by the simulator's masks and the depth on them; an
+    attempt in which an object is not seen is replaced like one that failed."""
     batch: int = 20
     """Episodes simulated at a time, and attempts a shard."""
 
@@ -87,7 +92,7 @@ class ScriptedExpert:
         environment, settings = self.environment, self.settings
         start_state = environment.reset(episode_keys(settings.seed, settings.split, self.task.name, start, count))
         state = start_state
-        keypoints = np.asarray(environment.keypoints(state))
+        keypoints, unseen = self._keypoints(state)
         plan = environment.expert(state)
         poses, grippers = np.asarray(plan.pose), np.asarray(plan.gripper_open)  # (B, M, A, 7), (B, M, A)
         generators = [
@@ -111,6 +116,7 @@ class ScriptedExpert:
         positions = np.stack([observation.pose[..., :3] for observation in observations], axis=1)
         active = np.asarray(self._replay_latch(positions, keypoints))
         good = np.asarray(environment.success(state)) & ~np.asarray(state.ik_failed) & ~np.asarray(state.diverged)
+        good &= ~unseen
 
         episodes: list[Episode | None] = []
         for i in range(count):
@@ -138,6 +144,15 @@ class ScriptedExpert:
                 )
             )
         return episodes
+
+    def _keypoints(self, state: SimState) -> tuple[np.ndarray, np.ndarray]:
+        """Of the reset state, (B, A, K, 3) metres, and bool (B,) where an object is not seen."""
+        find = keypoint_source(self.settings.keypoints, self.environment)
+        if find is None:
+            points = np.asarray(self.environment.keypoints(state))
+            return points, np.zeros(len(points), bool)
+        points, problems = find(state)(state, self.environment.observe(state))
+        return points, np.array([bool(problem) for problem in problems])
 
     def _misses(self, rng: np.random.Generator, frames: int) -> np.ndarray:
         """How far each key pose is missed, float (M, 1, 3) metres.

@@ -62,4 +62,5 @@ def open_held_out(data: DataConfig, tokenizer: Tokenizer, episodes: int) -> Epis
 
 
 def _simulator_settings(data: DataConfig) -> dict[str, Any]:
-    return {"image_size": data.image_size, "seed": data.seed, "perturb": data.perturb}
+    names = ("image_size", "seed", "perturb", "keypoints")
+    return {name: getattr(data, name) for name in names}

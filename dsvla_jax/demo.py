@@ -21,6 +21,7 @@ from dsvla_jax.geometry.cameras import project
 from dsvla_jax.policy import Decision, Policy
 from dsvla_jax.report import mark_targets, png_data, write_html
 from dsvla_jax.rollout import run_episodes
+from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
@@ -117,7 +118,8 @@ def describe(policy: Policy, seen: Observation, instruction: str, near: np.ndarr
 
 def main(options: Options) -> None:
     """Runs the episode and writes the page."""
-    data = load_experiment(options.run / "config.json").data
+    experiment = load_experiment(options.run / "config.json")
+    data = experiment.data
     (task,) = select_tasks((options.task,)) if options.task else select_tasks(data.tasks)[:1]
     policy, environment = dsvla_jax.policy.load(options.run), Environment(task, image_size=data.image_size)
     print(f"{task}, episode {options.seed}: compiling takes a minute the first time", flush=True)
@@ -130,7 +132,8 @@ def main(options: Options) -> None:
         print(f"key pose {len(steps)}: {decision.texts[0]}", flush=True)
         return decision.action, decision.texts
 
-    (ending,) = run_episodes(environment, act, state)
+    find = keypoint_source(experiment.keypoints, environment)
+    (ending,) = run_episodes(environment, act, state, find_keypoints=find(state) if find else None)
     out = options.out or options.run / "demo.html"
     write_html(
         out,

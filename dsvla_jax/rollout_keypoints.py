@@ -4,7 +4,8 @@ The paper finds them so (section 3.3), with Grounding DINO and SAM in the place 
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Literal
 
 import jax
 import numpy as np
@@ -15,6 +16,19 @@ from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.objects import object_masks
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.types import Observation
+
+Keypoints = Literal["oracle", "segmentation", "segmentation-refresh"]
+
+
+def keypoint_source(kind: Keypoints, environment: Environment) -> "Callable[[SimState], SegmentationKeypoints] | None":
+    """What makes the source of a batch of the environment's episodes from its reset state.
+
+    kind: `oracle`: None, for the task's own keypoints. `segmentation`: found in the first picture.
+    `segmentation-refresh`: in the picture before every key pose.
+    """
+    if kind == "oracle":
+        return None
+    return functools.partial(SegmentationKeypoints, environment, refresh=kind == "segmentation-refresh")
 
 
 class SegmentationKeypoints:

@@ -27,8 +27,9 @@ from data_pipelines.records import (
     unpack_episode,
 )
 from dsvla_jax.encoding.keypoints import replay_latch
+from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.types import Action
+from dsvla_jax.types import Action, Camera
 
 
 def random_episode(seed, task="lamp_on", arms=1, frames=3, size=8):
@@ -397,3 +398,18 @@ def test_recorded_expert_succeeds_again_from_its_seed(tmp_path):
     miss = np.abs(episode.pose[1, :, :3] - episode.target_pose[0, :, :3]).max()
     assert 0.002 < miss < 0.04
     np.testing.assert_array_equal(episode.active_keypoint, np.broadcast_to(episode.keypoints[:, 0], (2, 1, 3)))
+
+
+def test_keypoints_of_demonstrations_may_be_those_found_in_the_first_picture():
+    """The middle of the button is inside it; what is found is on the surface that the camera sees."""
+    expert = ScriptedExpert("lamp_on", Settings(batch=2, keypoints="segmentation"))
+    episodes = [episode for episode in expert(0, 2) if episode is not None]
+    assert episodes
+    for episode in episodes:
+        start = expert.environment.reset(episode_keys(0, "train", "lamp_on", episode.seed, 1))
+        frame, point = decode_frame(episode, 0), episode.keypoints[0, 0]
+        camera = Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
+        (u, v), depth = project(jnp.asarray(point), camera)
+        assert abs(frame["depth"][round(float(v)), round(float(u))] - depth) < 0.01
+        away = np.linalg.norm(point - np.asarray(expert.environment.keypoints(start))[0, 0, 0])
+        assert 1e-4 < away < 0.03

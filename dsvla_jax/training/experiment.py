@@ -87,6 +87,11 @@ class Experiment:
     max_skipped_steps: int = 10
     """Steps whose loss or gradient is not finite are skipped; a run with more of them stops."""
 
+    @property
+    def keypoints(self) -> Literal["oracle", "segmentation"]:
+        """What a policy of this experiment is told to go near in simulation, because it learned from the same."""
+        return self.data.keypoints if self.encoding.use_keypoints else "oracle"
+
     def __post_init__(self) -> None:
         if self.regime != "full" and self.model.lora is None:
             raise UserError(
