@@ -64,6 +64,8 @@ class Options:
     """Test conditions unlike those of training (paper, Table 4): instance, position, background, camera."""
     choice: Literal["greedy", "expected"] = "greedy"
     """Take the most probable integer of each number, or the one nearest to its mean."""
+    step: int | Literal["best"] | None = None
+    """The checkpoint to evaluate: its step, or the best by its score in training; the newest if not given."""
     seed: int = 0
     skip_finished: bool = False
     """Leave the tasks as they are that have been evaluated since the last training."""
@@ -87,7 +89,7 @@ def main(options: Options) -> None:
     missing = [name for name in tasks if name not in {result.task for result in kept}]
     results = kept
     if missing:
-        policy = dsvla_jax.policy.load(options.run, decoding=Decoding(options.choice))
+        policy = dsvla_jax.policy.load(options.run, decoding=Decoding(options.choice), step=options.step)
         if options.keypoints != "oracle" and not policy.config.encoding.use_keypoints:
             raise UserError(f"{options.run}: trained without keypoints; leave out --keypoints {options.keypoints}")
         for name in missing:
@@ -128,7 +130,8 @@ def results_file(run: Path, options: Options) -> Path:
     shifts = "".join(f"-{name}" for name in check_shifts(options.shift))
     choice = f"-{options.choice}" if options.choice != "greedy" else ""
     seed = f"-seed-{options.seed}" if options.seed else ""
-    return run / "eval" / f"{options.physics}{keypoints}{noise}{shifts}{choice}{seed}.jsonl"
+    step = f"-step-{options.step}" if options.step is not None else ""
+    return run / "eval" / f"{options.physics}{keypoints}{noise}{shifts}{choice}{seed}{step}.jsonl"
 
 
 def other_physics(physics: str) -> str:

@@ -107,6 +107,9 @@ def main(experiment: Experiment, options: Options) -> int:
     where = find_slice(options.topology)
     if where.virtual:
         print("no TPU compiler (pip install 'dsvla-jax[planner]'): planning on virtual CPU devices", file=sys.stderr)
+    elif experiment.model.attention == "auto":
+        # That would be chosen for the processor that compiles.
+        experiment = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, attention="fused"))
     if options.mesh_sizes:
         experiment = dataclasses.replace(experiment, mesh=parse_mesh(options.mesh_sizes))
     meshes = list(candidate_meshes(experiment, where)) if options.search else [experiment.mesh]
