@@ -77,11 +77,11 @@ def main(options: Options) -> None:
     """Evaluates, prints the table, writes results and report."""
     if options.compare:
         runs = (options.run, *options.compare)
-        files = {run: results_file(run, with_keypoints(options, load_run(run))) for run in runs}
-        print_comparison({str(run): read_results(file) for run, file in files.items()})
+        print_comparison({str(run): read_results(results_file(run, options)) for run in runs})
         return
-    experiment = load_run(options.run)
-    options = with_keypoints(options, experiment)
+    if not (options.run / "config.json").exists():
+        raise UserError(f"{options.run}: no run here (config.json is missing); train one: python train.py CONFIG")
+    experiment = load_experiment(options.run / "config.json")
     tasks = select_tasks(options.tasks or experiment.data.tasks)
     episodes = options.episodes or experiment.evaluation.episodes
     file = results_file(options.run, options)
@@ -90,7 +90,7 @@ def main(options: Options) -> None:
     results = kept
     if missing:
         policy = dsvla_jax.policy.load(options.run, decoding=Decoding(options.choice), step=options.step)
-        if options.keypoints != "oracle" and not policy.config.encoding.use_keypoints:
+        if options.keypoints and not policy.config.encoding.use_keypoints:
             raise UserError(f"{options.run}: trained without keypoints; leave out --keypoints {options.keypoints}")
         for name in missing:
             endings = evaluate_task(policy, experiment, name, episodes, options)
@@ -111,21 +111,9 @@ def main(options: Options) -> None:
     print(f"report: {report}")
 
 
-def load_run(run: Path) -> Experiment:
-    """What was trained there. Raises UserError where nothing was."""
-    if not (run / "config.json").exists():
-        raise UserError(f"{run}: no run here (config.json is missing); train one: python train.py CONFIG")
-    return load_experiment(run / "config.json")
-
-
-def with_keypoints(options: Options, experiment: Experiment) -> Options:
-    """With the kind of keypoints that the run learned from, where the options name none."""
-    return dataclasses.replace(options, keypoints=options.keypoints or experiment.keypoints)
-
-
 def results_file(run: Path, options: Options) -> Path:
     """Where the results of these conditions are kept; the physics alone name the plain ones."""
-    keypoints = f"-{options.keypoints}" if options.keypoints not in (None, "oracle") else ""
+    keypoints = f"-keypoints-{options.keypoints}" if options.keypoints else ""
     noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
     shifts = "".join(f"-{name}" for name in check_shifts(options.shift))
     choice = f"-{options.choice}" if options.choice != "greedy" else ""
@@ -161,7 +149,7 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
         seed=options.seed,
         batch=options.batch,
         keypoint_noise=options.keypoint_noise,
-        find_keypoints=keypoint_source(options.keypoints or "oracle", environment),
+        find_keypoints=keypoint_source(options.keypoints or experiment.keypoints, environment),
         label=f"{name} ({options.physics})",
     )
 

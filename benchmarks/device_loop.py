@@ -25,6 +25,7 @@ from dsvla_jax.device_rollout import DeviceRollout, Rollout
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.policy import Policy
 from dsvla_jax.rollout import Ending, run_episodes
+from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.training.experiment import load_experiment
@@ -67,15 +68,19 @@ def timed(what: Callable[[], T]) -> tuple[T, float, float]:
 
 
 def main(options: Options) -> int:
-    policy, data = dsvla_jax.policy.load(options.run), load_experiment(options.run / "config.json").data
+    policy, experiment = dsvla_jax.policy.load(options.run), load_experiment(options.run / "config.json")
     different = 0
     for task in options.tasks:
-        environment = Environment(task, "mjx", image_size=data.image_size)
+        environment = Environment(task, "mjx", image_size=experiment.data.image_size)
         on_device = DeviceRollout(environment, policy)
         for batch in options.batches:
             state = environment.reset(episode_keys(0, "eval", task, 0, batch))
-            endings, host_first, host = timed(partial(run_episodes, environment, policy.act, state))
-            rollout, device_first, device = timed(partial(on_device, state))
+            find = keypoint_source(experiment.keypoints, environment)
+            source = find(state) if find else None
+            keypoints = source(state, environment.observe(state))[0] if source else None
+            from_host = partial(run_episodes, environment, policy.act, state, find_keypoints=source)
+            endings, host_first, host = timed(from_host)
+            rollout, device_first, device = timed(partial(on_device, state, keypoints))
             same = agreeing(policy, endings, rollout)
             different += batch - same
             print(

@@ -83,6 +83,7 @@ def main(options: Options) -> int:
         placed(environment.mjx_model, everywhere),
         placed(variables, shardings(variables, mesh)),
         placed(state, spread),
+        placed(jax.eval_shape(environment.keypoints, state), spread),
         *(placed(jax.ShapeDtypeStruct(x.shape, x.dtype), spread) for x in (beginnings, lengths)),
     )
     start = time.perf_counter()

@@ -57,8 +57,8 @@ class Settings:
     with the expert's next key pose as the target."""
     perturb_probability: float = 0.5
     """How often a key pose is missed on purpose."""
-    keypoints: Literal["oracle", "segmentation"] = "oracle"
-    """The task's own points, or those found in the first picture by the simulator's masks and the depth on them; an
+    keypoints: Literal["segmentation", "oracle"] = "segmentation"
+    """Those found in the first picture by the simulator's masks and the depth on them, or the task's own points. An
     attempt in which an object is not seen is replaced like one that failed."""
     batch: int = 20
     """Episodes simulated at a time, and attempts a shard."""

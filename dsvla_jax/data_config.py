@@ -20,9 +20,9 @@ class DataConfig:
     seed: int = 0
     perturb: float = 0.03
     """Metres by which half of the key poses are missed on purpose, so that the next sample starts off the path."""
-    keypoints: Literal["oracle", "segmentation"] = "oracle"
-    """Of simulated demonstrations, and so of evaluation unless it is told otherwise: the task's own points, or those
-    found in the first picture by the simulator's masks and the depth on them (paper, section 3.3)."""
+    keypoints: Literal["segmentation", "oracle"] = "segmentation"
+    """Of simulated demonstrations, and so of evaluation unless it is told otherwise: those found in the first picture
+    by the simulator's masks and the depth on them (paper, section 3.3), or the task's own points."""
     shift_world: float = 0.0
     """Metres: pose, keypoints, target and camera are moved by one random offset, so the picture stays true."""
     crop: float = 1.0

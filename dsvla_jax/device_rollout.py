@@ -38,7 +38,7 @@ class Rollout:
     keyframes: Array
 
 
-Loop = Callable[[Any, Variables, SimState, Array, Array], Rollout]
+Loop = Callable[[Any, Variables, SimState, Array, Array, Array], Rollout]
 
 
 def device_loop(
@@ -49,10 +49,10 @@ def device_loop(
     longest_instruction: int,
     decoding: Decoding = GREEDY,
 ) -> Loop:
-    """The pure ``(mjx_model, variables, state, beginnings (B, P), lengths (B,)) -> Rollout`` of an MJX environment.
+    """The pure ``(mjx_model, variables, state, keypoints, beginnings, lengths) -> Rollout`` of an MJX environment.
 
-    limit: L. longest_instruction: P, see `prompt_table.instruction_tokens`. ``decoding`` must not sample. Keypoints are
-    those of the given state, the first frame's.
+    keypoints: float32 (B, A, K, 3), of the whole episode. beginnings: (B, P), lengths: (B,), the instructions' tokens,
+    see `prompt_table.instruction_tokens`. limit: L. longest_instruction: P. ``decoding`` must not sample.
     Raises ValueError for what only `rollout.run_episodes` does: C physics, and answers that are displacements.
     """
     if config.displacement is not None:
@@ -78,8 +78,9 @@ def device_loop(
         answer = decode_actions(VLA(config.model), variables, inputs, grammar, decoding, None).integers
         return environment.execute_in_mjx(mjx_model, state, encoding.codec.decode(answer)), answer
 
-    def run(mjx_model: Any, variables: Variables, state: SimState, beginnings: Array, lengths: Array) -> Rollout:
-        keypoints = environment.keypoints(state)
+    def run(
+        mjx_model: Any, variables: Variables, state: SimState, keypoints: Array, beginnings: Array, lengths: Array
+    ) -> Rollout:
         batch = keypoints.shape[0]
 
         def going_on(carry: tuple) -> Array:
@@ -125,10 +126,15 @@ class DeviceRollout:
         loop = device_loop(environment, policy.config, policy.tokenizer, limit, self._longest, policy.decoding)
         self._run = jit_with_mjx(loop)
 
-    def __call__(self, state: SimState) -> Rollout:
-        """The episodes of a reset state, each told its task in another way, as `rollout.run_episodes` does."""
+    def __call__(self, state: SimState, keypoints: Array | np.ndarray | None = None) -> Rollout:
+        """The episodes of a reset state, each told its task in another way, as `rollout.run_episodes` does.
+
+        keypoints: float32 (B, A, K, 3), those of a `rollout.KeypointSource` for the first frame; the task's own if not
+            given.
+        """
         instructions = self._environment.instructions(state, np.arange(state.qpos.shape[0]))
         encoding, arms = self._policy.config.encoding, self._environment.num_arms
         beginnings, lengths = instruction_tokens(self._policy.tokenizer, encoding, arms, instructions)
         beginnings = np.pad(beginnings, ((0, 0), (0, self._longest - beginnings.shape[1])))
-        return self._run(self._environment.mjx_model, self._policy.variables, state, beginnings, lengths)
+        keypoints = jnp.asarray(self._environment.keypoints(state) if keypoints is None else keypoints)
+        return self._run(self._environment.mjx_model, self._policy.variables, state, keypoints, beginnings, lengths)

@@ -9,6 +9,7 @@ from dsvla_jax.device_rollout import DeviceRollout
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.rollout import run_episodes
+from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from tests.serving import SIZE, tiny_policy
@@ -19,8 +20,11 @@ def test_both_loops_give_the_same_episodes():
     environment = Environment("lamp_on", "mjx", image_size=SIZE)
     policy = tiny_policy()
     state = environment.reset(episode_keys(0, "validation", "lamp_on", 0, 3))
-    endings = run_episodes(environment, policy.act, state, limit=3)
-    rollout = DeviceRollout(environment, policy, limit=3)(state)
+    source = SegmentationKeypoints(environment, state)
+    found, problems = source(state, environment.observe(state))
+    assert problems == [""] * 3
+    endings = run_episodes(environment, policy.act, state, limit=3, find_keypoints=source)
+    rollout = DeviceRollout(environment, policy, limit=3)(state, found)
     style = policy.config.encoding.style
     for i, ending in enumerate(endings):
         assert rollout.keyframes[i] == ending.keyframes

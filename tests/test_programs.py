@@ -30,7 +30,7 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (["train.py", "tiny", "--steps", "many"], "many"),
         (["train.py", "tiny", "--data.tasks", "lamp_of"], "lamp_on"),
         (["eval.py", "nowhere"], "no run here"),
-        (["eval.py", "nowhere", "--compare", "elsewhere"], "no run here"),
+        (["eval.py", "nowhere", "--compare", "elsewhere"], "no results here; evaluate first"),
         (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
     ],
 )
