@@ -26,7 +26,7 @@ class Kernels:
 
 def take_apart(variables: Variables) -> Variables:
     """The same variables with the floating-point kernels of stacked layers as `Kernels`. Not for sharded arrays."""
-    flat = traverse_util.flatten_dict(variables)
+    flat: dict[tuple, Any] = dict(traverse_util.flatten_dict(variables))
     for path, leaf in flat.items():
         if "layers" in path and path[-1] == "kernel" and jnp.issubdtype(leaf.dtype, jnp.floating):
             # One leaf after the other, so that never more than one is there twice.
