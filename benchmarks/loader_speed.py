@@ -1,4 +1,4 @@
-"""The loaders: frames/s and memory against tf.data, flat memory over 20 passes, statistics in time (three minutes).
+"""The loaders: frames/s and memory against tf.data, flat memory over 20 passes, statistics in time (four minutes).
 
 Needs the `tensorflow` extra, here or in another environment (``--peer-python /path/to/python``); ``--no-peer`` leaves
 the comparison out. On one 256-pixel dataset both crop, vary colours, resize to 224 and batch; each runs in a process of
@@ -25,6 +25,7 @@ import numpy as np
 
 NAME, STEPS, BATCH, SIZE, CROP = "libero_10_no_noops", 50, 32, 224, 0.9
 SPEED, MEMORY, GROWTH, SECONDS = 1.5, 0.5, 1.05, 10.0
+ROUNDS = 7
 
 
 def write_data(folder: Path, episodes: int, copies: int = 1) -> None:
@@ -198,7 +199,7 @@ def compare(folder: Path, frames: int, peer_python: str) -> dict[str, tuple[floa
     """Prints what both loaders do by turns, and returns the ratios with what is asked of them."""
     rounds = [
         (in_process("ours", folder, frames), in_process("tf_data", folder, frames, python=peer_python))
-        for _ in range(3)
+        for _ in range(ROUNDS)
     ]
     ratios = [mine["speed"] / peer["speed"] for mine, peer in rounds]
     mine, peer = (
