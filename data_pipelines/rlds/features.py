@@ -66,18 +66,16 @@ class RldsEpisode:
         self.num_steps = self._count_steps()
 
     def _count_steps(self) -> int:
-        """Counted on the first feature of the steps that the record holds; `column` compares the others with it."""
-        known = False
+        """What most features of the steps that the record holds agree on; `column` compares each with it."""
+        counts = []
         for path, feature in self._features.items():
-            if not path.startswith(f"{STEPS}/") or not isinstance(feature, Tensor | Image) or not _is_simple(feature):
-                continue
-            known = known or path in self._values
-            values = _list_of(self._values[path]) if path in self._values else None
-            if values:
-                return len(values) // max(_values_a_step(feature), 1)
-        if not known:
+            simple = isinstance(feature, Tensor | Image) and _is_simple(feature)
+            if path.startswith(f"{STEPS}/") and simple and path in self._values:
+                counts.append(len(_list_of(self._values[path]) or ()) // max(_values_a_step(feature), 1))
+        if not counts:
             raise DataError(self.where, STEPS, "at least one feature of the steps", "none", _FIX)
-        return 0
+        # Of as many, the larger: what is damaged more often lacks something. A feature of shape (0,) has no values.
+        return max(set(filter(None, counts)), key=lambda count: (counts.count(count), count), default=0)
 
     def __contains__(self, path: str) -> bool:
         return path in self._features
