@@ -1,11 +1,8 @@
-"""RLBench, PerAct and PerAct2 demonstrations: key poses, restricted unpickling, import, and what is refused."""
+"""RLBench, PerAct and PerAct2 demonstrations: import, and what is refused."""
 
 import io
-import os
 import pickle
-import random
 import shutil
-import subprocess
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,191 +13,10 @@ from data_pipelines.keyframes import discover_keyframes, sample_starts
 from data_pipelines.records import DataError, decode_frame
 from data_pipelines.rlbench.__main__ import Options, Settings, contact_keypoints, import_demonstrations, main
 from data_pipelines.rlbench.files import find_episodes, read_recording, unpack_depth
-from data_pipelines.rlbench.unpickle import read_pickle, to_array
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.types import Camera
 from tests import rlbench_files as files
-
-
-def restated_keyframes(gripper, still):
-    """PerAct's rule as its authors' documentation and code word it, for lists of one arm: gripper[i], still[i]."""
-    count, frames, wait = len(gripper), [], 0
-    for i in range(count):
-        unchanged = i < count - 2 and gripper[i] == gripper[i + 1] and gripper[i] == gripper[i - 1]
-        unchanged = unchanged and gripper[i - 2] == gripper[i - 1]
-        stop = wait <= 0 and still[i] and i != count - 2 and unchanged
-        if stop:
-            wait = 4
-        else:
-            wait -= 1
-        if i == 0:
-            continue
-        if gripper[i] != gripper[i - 1] or i == count - 1 or stop:
-            frames.append(i)
-    if len(frames) >= 2 and frames[-2] == frames[-1] - 1:
-        frames.pop(len(frames) - 2)
-    return frames
-
-
-def keyframes(gripper, still):
-    """`discover_keyframes` for strings: o open, x closed; . still, m moving."""
-    opened = np.array([[letter == "o"] for letter in gripper], float)
-    velocity = np.array([[[0.0, -0.1] if letter == "." else [0.0, -0.1001]] for letter in still])
-    found = discover_keyframes(opened, velocity)
-    assert found == restated_keyframes(gripper, [letter == "." for letter in still])
-    return found
-
-
-@pytest.mark.parametrize(
-    ("gripper", "still", "expected"),
-    [
-        ("oooooooooo", "mmmmmmmmmm", [9]),  # only the end
-        ("ooooxxxxxx", "mmmmmmmmmm", [4, 9]),  # the first frame in which the gripper has changed
-        ("ooooxxxxxo", "mmmmmmmmmm", [4, 9]),  # a change at the end is the end
-        ("ooooooooox", "mmmmmmmmmm", [9]),
-        ("oooooooxox", "mmmmmmmmmm", [7, 9]),  # of 8 and 9 the end stays
-        ("oooooooxxo", "mmmmmmmm..", [7, 9]),  # no stop in the last two frames
-        ("oooooooooo", "mmmm.mmmmm", [4, 9]),
-        ("oooooooooooooo", "mmm..........m", [3, 8, 13]),  # a stop, and 4 frames later at the earliest the next one
-        ("oooooooooo", "mmmmmmm.mm", [7, 9]),
-        ("oooooooooo", "mmmmmmmm.m", [9]),  # the last but one never stops
-        ("oooxxxxxxx", "mm...mmmmm", [3, 9]),  # still around a change, which is no stop
-        ("oooxxxxxxx", "mm....mmmm", [3, 5, 9]),  # still from 2 on, but a stop only once the gripper rests
-        ("oo", "..", [1]),
-        ("ooo", "...", [2]),
-        ("o", ".", []),
-    ],
-)
-def test_key_poses_are_peracts(gripper, still, expected):
-    assert keyframes(gripper, still) == expected
-
-
-def test_looking_back_from_the_start_wraps_to_the_end():
-    # The gripper ends as it starts, so frame 0 is a stop by what frames -1 and -2 hold, and uses the buffer up.
-    assert keyframes("oooooooooo", "....mmmmmm") == [9]
-    assert keyframes("oooooooooo", "......mmmm") == [5, 9]
-    # It ends in another state: no stop at 0 and 1, so 2 is one.
-    assert keyframes("oooooooxxx", "....mmmmmm") == [2, 7, 9]
-    # Only the last but one differs: frame 0 looks at it, frame 1 does not.
-    assert keyframes("oooooooxxo", "....mmmmmm") == [1, 7, 9]
-
-
-def test_key_poses_of_random_demonstrations_are_peracts():
-    rng = random.Random(0)
-    for _ in range(500):
-        count = rng.randint(1, 40)
-        gripper, still = [rng.choice("oox")], [rng.choice(".m")]
-        for _ in range(count - 1):
-            gripper.append(rng.choice(gripper[-1] * 9 + "ox"))
-            still.append(rng.choice(still[-1] * 4 + ".m"))
-        keyframes("".join(gripper), "".join(still))
-
-
-def test_two_arms_stop_together_and_change_alone():
-    gripper = np.ones((20, 2))
-    gripper[12:, 1] = 0
-    velocity = np.ones((20, 2, 7))
-    velocity[3:6, 0] = 0  # one arm waits
-    velocity[8, :] = 0  # both do
-    assert discover_keyframes(gripper, velocity) == [8, 12, 19]
-
-
-def test_samples_start_at_key_poses_and_every_nth_frame():
-    assert sample_starts([7, 12, 25], 0) == [(0, 7), (7, 12), (12, 25)]
-    assert sample_starts([7, 12, 25], 10) == [(0, 7), (7, 12), (10, 12), (12, 25), (20, 25)]
-    assert sample_starts([], 10) == []
-
-
-class Loud:
-    """Leaves a file behind when it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.path),)
-
-
-def global_payload(module, name, path):
-    """A pickle that calls module.name(path), in the plain text protocol."""
-    return f"c{module}\n{name}\n(V{path}\ntR.".encode()
-
-
-def test_nothing_in_a_pickle_is_run(tmp_path):
-    victim = tmp_path / "made"
-    payloads = {
-        "reduce": pickle.dumps(Loud(victim)),
-        "nested": pickle.dumps({"_observations": [1, {"misc": Loud(victim)}]}),
-        "posix": global_payload("posix", "mkdir", victim),
-        "builtins": global_payload("builtins", "eval", f"__import__('os').mkdir('{victim}')"),
-        "numpy": global_payload("numpy.testing._private.utils", "runstring", victim),
-        "dotted": b"\x80\x04\x8c\x05numpy\x8c\x11ndarray.__class__\x93.",
-        "codecs": global_payload("_codecs", "lookup", victim),
-        "rlbench": global_payload("rlbench.backend.utils", "image_to_float_array", victim),
-        "process": pickle.dumps(subprocess.Popen),
-    }
-    path = tmp_path / "low_dim_obs.pkl"
-    for data in payloads.values():
-        path.write_bytes(data)
-        with pytest.raises(DataError, match=r"low_dim_obs.pkl: pickle: expected only .*nothing in it was run"):
-            read_pickle(path)
-        assert not victim.exists()
-    # The payloads are real: pickle itself runs them.
-    pickle.loads(payloads["reduce"])
-    assert victim.exists()
-
-
-def test_known_names_stay_inert(tmp_path):
-    # `encode` is known, but what it is called with is only kept.
-    path = tmp_path / "x.pkl"
-    path.write_bytes(b"c_codecs\nencode\n(Vtext\nVno such encoding\ntR.")
-    assert read_pickle(path).args == ("text", "no such encoding")
-    path.write_bytes(pickle.dumps(np.array([{"a": 1}, None], object)))
-    with pytest.raises(ValueError, match="an array of"):
-        to_array(read_pickle(path))
-
-
-@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
-def test_arrays_come_back(tmp_path, protocol):
-    values = [
-        np.arange(6, dtype=np.float32).reshape(2, 3),
-        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
-        np.arange(4, dtype=">i4"),
-        np.array([]),
-        np.array(1.5),
-        np.float64(2.5),
-        np.int64(-7),
-        np.bool_(True),
-        np.array([True, False]),
-    ]
-    path = tmp_path / "x.pkl"
-    path.write_bytes(pickle.dumps(values, protocol))
-    for read, value in zip(read_pickle(path), values, strict=True):
-        np.testing.assert_array_equal(to_array(read), value)
-        assert to_array(read).shape == np.shape(value)
-
-
-def test_damaged_pickles_are_refused_and_named(tmp_path):
-    files.write_episode(tmp_path, frames=5, size=8)
-    path = tmp_path / "low_dim_obs.pkl"
-    whole = path.read_bytes()
-    rng = random.Random(0)
-    damaged = [whole[: rng.randrange(len(whole))] for _ in range(50)]
-    for _ in range(400):
-        changed = bytearray(whole)
-        for _ in range(3):
-            changed[rng.randrange(len(whole))] = rng.randrange(256)
-        damaged.append(bytes(changed))
-    refused = []
-    for data in damaged:
-        path.write_bytes(data)
-        try:
-            read_recording(tmp_path, "lamp_on")
-        except DataError as error:
-            refused.append(str(error))
-    assert len(refused) > 50  # all the short ones, and changes of structure
-    assert all("low_dim_obs.pkl" in message for message in refused)
 
 
 @pytest.fixture(scope="module")
@@ -375,7 +191,7 @@ DAMAGED = {
         r"low_dim_obs.pkl: pickle: expected only .*_io.BytesIO",
     ),
     "reduce payload": (
-        lambda folder: (folder / "low_dim_obs.pkl").write_bytes(pickle.dumps(Loud(folder / "made"))),
+        lambda folder: (folder / "low_dim_obs.pkl").write_bytes(pickle.dumps(files.Loud(folder / "made"))),
         r"low_dim_obs.pkl: pickle: expected only .*mkdir.*nothing in it was run",
     ),
     "no pickle": (lambda folder: (folder / "low_dim_obs.pkl").unlink(), "low_dim_obs.pkl: file: .*No such file"),
