@@ -34,7 +34,7 @@ from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
-from dsvla_jax.types import Action
+from dsvla_jax.types import Action, Observation
 
 # Attempts, as a multiple of the episodes asked for, after which an expert counts as broken.
 MAX_ATTEMPTS = 10
@@ -92,7 +92,6 @@ class ScriptedExpert:
         environment, settings = self.environment, self.settings
         start_state = environment.reset(episode_keys(settings.seed, settings.split, self.task.name, start, count))
         state = start_state
-        keypoints, unseen = self._keypoints(state)
         plan = environment.expert(state)
         poses, grippers = np.asarray(plan.pose), np.asarray(plan.gripper_open)  # (B, M, A, 7), (B, M, A)
         generators = [
@@ -113,6 +112,7 @@ class ScriptedExpert:
         # Success after so many key poses of the plan, none of them missed: bool (B, M + 1).
         unmissed = environment.follow(start_state, plan)
         replayed = np.stack([np.asarray(environment.success(after)) for after in unmissed], axis=1)
+        keypoints, unseen = self._keypoints(start_state, observations[0])
         positions = np.stack([observation.pose[..., :3] for observation in observations], axis=1)
         active = np.asarray(self._replay_latch(positions, keypoints))
         good = np.asarray(environment.success(state)) & ~np.asarray(state.ik_failed) & ~np.asarray(state.diverged)
@@ -145,13 +145,13 @@ class ScriptedExpert:
             )
         return episodes
 
-    def _keypoints(self, state: SimState) -> tuple[np.ndarray, np.ndarray]:
-        """Of the reset state, (B, A, K, 3) metres, and bool (B,) where an object is not seen."""
+    def _keypoints(self, state: SimState, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
+        """Of the reset state and what is seen of it, (B, A, K, 3) metres, and bool (B,) where an object is not seen."""
         find = keypoint_source(self.settings.keypoints, self.environment)
         if find is None:
             points = np.asarray(self.environment.keypoints(state))
             return points, np.zeros(len(points), bool)
-        points, problems = find(state)(state, self.environment.observe(state))
+        points, problems = find(state)(state, observation)
         return points, np.array([bool(problem) for problem in problems])
 
     def _misses(self, rng: np.random.Generator, frames: int) -> np.ndarray:

@@ -171,8 +171,7 @@ def _section(
     if samples[0].camera is not None:
         drawn += draw_clouds(frames[0])
     lines = []
-    for i in chosen:
-        ((prompt, answer, _),) = prompts_and_answers([samples[i]], encoding, scale)
+    for prompt, answer, _ in prompts_and_answers([samples[i] for i in chosen], encoding, scale):
         lines += [prompt, f"    {answer}"]
     heading = f"{episode.where}: “{samples[0].instruction}”"
     return Section(heading, drawn, lines), frames[0] if samples[0].camera is not None else None

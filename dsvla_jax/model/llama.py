@@ -243,16 +243,14 @@ class Llama(nn.Module):
 
         A loop over stacked layers cannot do that; unrolled, they need no such loop.
         """
-        layers = self.config.language.layers
+        layers, block = self.config.language.layers, rematerialised(DecoderBlock, self.config)
         # Not indexed, because the gradient of `split` puts the layers' gradients side by side and adds up nothing.
         leaves, structure = jax.tree.flatten(self.layers.variables)
         parts = [jax.lax.split(leaf, (1,) * layers) for leaf in leaves]
         for layer in range(layers):
             variables = structure.unflatten([part[layer].squeeze(0) for part in parts])
-            block = rematerialised(DecoderBlock, self.config)
-            x, _ = block(self.config, first_row if layer == layers - 1 else 0, parent=None).apply(
-                variables, x, tables, mask
-            )
+            first = first_row if layer == layers - 1 else 0
+            x, _ = block(self.config, first, parent=None).apply(variables, x, tables, mask)
         return x
 
     def lm_head(self, hidden: Array, tokens: np.ndarray | Array | None = None) -> Array:
