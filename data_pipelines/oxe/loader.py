@@ -2,6 +2,7 @@
 
 import dataclasses
 import operator
+import os
 import sys
 from collections.abc import Iterator
 from typing import Any, SupportsIndex
@@ -37,11 +38,13 @@ class OxeLoader(Iterator[Sample]):
         seed: int,
         process_index: int = 0,
         process_count: int = 1,
-        num_threads: int = 4,
+        num_threads: int | None = None,
         progress: bool = True,
     ):
         """batch_size: of one process; processes take the numbers of the one stream in turns.
 
+        num_threads: that make batches beside the caller, 0 for none; by default one a processor and at most 4, since
+            what a batch needs of Python itself keeps others waiting.
         The order depends on `seed` and the config only: not on processes, threads or where a run was interrupted.
         """
         self.source = MixtureSource(config, seed, progress)
@@ -59,6 +62,7 @@ class OxeLoader(Iterator[Sample]):
         self.left_out = _Reported(self.source.left_out)
         to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self.left_out.append)
         batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
+        num_threads = min(4, os.cpu_count() or 1) if num_threads is None else num_threads
         options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=2 * num_threads)
         dataset = batches.map(to_batch).to_iter_dataset(options)
         self._batches: grain.DatasetIterator[Sample] = iter(dataset)

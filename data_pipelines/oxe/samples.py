@@ -43,25 +43,26 @@ def make_batcher(
         return {"text_tokens": tokens, "text_mask": mask, "answer_mask": answer_mask, "number_rows": rows}
 
     def batch(frames: Sequence[tuple[int, EncodedSample]]) -> Sample | None:
+        # All texts and then all pictures: by turns, each would push the other out of the processor's caches.
+        texts = [text(*words) for words in prompts_and_answers([frame for _, frame in frames], encoding, scale)]
         rgb = np.empty((len(frames), config.image_size, config.image_size, 3), np.uint8)
-        rows: list[Sample | None] = []
-        texts = prompts_and_answers([frame for _, frame in frames], encoding, scale)
-        for row, ((number, frame), words) in enumerate(zip(frames, texts, strict=True)):
+        cameras: dict[int, Sample] = {}
+        for row, (number, frame) in enumerate(frames):
             try:
                 rng = np.random.default_rng([seed, number])
-                rows.append({**write_picture(frame, rng, config, encoding.use_points, rgb[row]), **text(*words)})
+                cameras[row] = write_picture(frame, rng, config, encoding.use_points, rgb[row])
             except DataError as error:
                 if not config.skip_bad:
                     raise
                 leave_out((frame.where, str(error).removeprefix(f"{frame.where}: ")))
-                rows.append(None)
-        good = [row for row, sample in enumerate(rows) if sample is not None]
-        if not good:
+        if not cameras:
             return None
-        chosen = [min(good, key=lambda other: abs(other - row)) for row in range(len(rows))]
-        samples = [rows[row] for row in chosen]
-        stacked = {name: np.stack([sample[name] for sample in samples if sample]) for name in rows[good[0]] or {}}
-        return {"rgb": rgb if len(good) == len(rows) else rgb[chosen], **stacked}
+        chosen = list(range(len(frames)))
+        if len(cameras) < len(frames):
+            chosen = [min(cameras, key=lambda other: abs(other - row)) for row in chosen]
+            rgb = rgb[chosen]
+        samples = [{**cameras[row], **texts[row]} for row in chosen]
+        return {"rgb": rgb, **{name: np.stack([sample[name] for sample in samples]) for name in samples[0]}}
 
     return batch
 

@@ -9,6 +9,7 @@ a space (``grammar.tokenize_answer``).
 """
 
 import dataclasses
+import functools
 import re
 from collections.abc import Sequence
 from typing import Literal
@@ -81,12 +82,13 @@ def format_prompt(instruction: str, state_ints: ArrayLike, keypoint_ints: ArrayL
     return _WRAPPER.format(" ".join(sentences))
 
 
-def answer_pieces(num_arms: int, style: Style) -> list[str | Slot]:
+@functools.cache
+def answer_pieces(num_arms: int, style: Style) -> tuple[str | Slot, ...]:
     """The answer as fixed texts and slots, in order; joining them with integers in the slots gives the answer."""
     sides = _sides(num_arms)
     if _check_style(style) == "compact":
         slots = [slot for _ in sides for slot in _ARM_SLOTS]
-        return [piece for slot in slots for piece in (" ", slot)][1:]
+        return tuple(piece for slot in slots for piece in (" ", slot))[1:]
     pieces: list[str | Slot] = []
     for index, side in enumerate(sides):
         gripper = f"The {side} gripper".replace("  ", " ")
@@ -99,7 +101,7 @@ def answer_pieces(num_arms: int, style: Style) -> list[str | Slot]:
             GRIPPER_SLOT,
             ".",
         ]
-    return pieces
+    return tuple(pieces)
 
 
 def format_answer(ints: ArrayLike, style: Style) -> str:
