@@ -228,6 +228,25 @@ def test_relative_answers_lead_to_where_the_hand_went(folder, name):
             assert answer.gripper_open[i] == gripper
 
 
+def test_of_many_frames_evenly_spaced_ones_of_both_arms_make_the_statistics(folder, monkeypatch):
+    name = "utokyo_xarm_bimanual_converted_externally_to_rlds"
+    monkeypatch.setattr("data_pipelines.oxe.index.KEPT_FRAMES", 30)
+    index = scan(RldsBuild(folder / name), get_dataset(name), config_for(folder, (name,)), progress=False)
+    ahead = max(1, round(config_for(folder).horizon * get_dataset(name).hz))
+    frames = []
+    for known in known_episodes(name, 9, 9):
+        for step in range(known.num_steps - 1):
+            end = min(step + ahead, known.num_steps - 1)
+            moved = [
+                (arm.position[end] - arm.position[step], (arm.rotation[end] * arm.rotation[step].inv()).as_rotvec())
+                for arm in known.arms
+            ]
+            frames.append(np.reshape(moved, (2, 6)))
+    assert len(frames) == index.num_samples == 81
+    expected = np.quantile(np.concatenate(frames[::4]), np.linspace(0, 1, 101), axis=0)
+    np.testing.assert_allclose(index.quantiles, expected, atol=1e-5)
+
+
 def test_absolute_answers_are_poses_and_prompts_have_no_keypoint(folder):
     name = names_of(FIVE)[0]
     loader = make(folder, (name,), streams=1, target="absolute", horizon=0.0, threads=0, batch_size=16)

@@ -27,8 +27,8 @@ from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.text import split_words
 
 VERSION = 2
-KEPT_ROWS = 1 << 18
-"""Rows of displacements that quantiles are taken from; of more, evenly spaced ones are kept."""
+KEPT_FRAMES = 1 << 18
+"""Frames whose displacements quantiles are taken from; of more, evenly spaced ones are kept."""
 QUANTILES = 101
 
 
@@ -117,16 +117,16 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
                 places.append((number, record, len(made.frame)))
             if made.displacement is not None:
                 taken = np.arange(seen, seen + len(made.frame)) % spacing == 0
-                rows.append(made.displacement[taken].reshape(-1, 6))
+                rows.append(made.displacement[taken])
                 seen += len(made.frame)
-                if sum(map(len, rows)) > KEPT_ROWS:
+                if sum(map(len, rows)) > KEPT_FRAMES:
                     rows, spacing = [np.concatenate(rows)[::2]], 2 * spacing
         records.close()
     bar.close()
     shard_of, record_of, samples = np.array(places, np.int64).reshape(-1, 3).T
     quantiles = None
     if rows:
-        quantiles = np.quantile(np.concatenate(rows), np.linspace(0, 1, QUANTILES), axis=0)
+        quantiles = np.quantile(np.concatenate(rows).reshape(-1, 6), np.linspace(0, 1, QUANTILES), axis=0)
     return Index(
         shards=[shard.path for shard in shards],
         offsets=offsets if build.format == "tfrecord" else None,
