@@ -137,6 +137,13 @@ DAMAGE = {
         r"steps/action: expected float32 \(8,\) a step",
         5,
     ),
+    "empty column": (
+        STRETCH,
+        in_record(lambda features: features["steps/action"].float_list.ClearField("value")),
+        RECORD,
+        r"steps/action: expected float32 \(8,\) a step",
+        5,
+    ),
     "nan action": (
         FRACTAL,
         in_record(set_number("steps/action/gripper_closedness_action", 2, np.nan)),

@@ -232,6 +232,21 @@ def test_missing_and_unknown_features(tmp_path):
         next(episodes_of(RldsBuild(folder))).column("steps/absent")
 
 
+@pytest.mark.parametrize("encoding", ["bytes", "zlib"])
+def test_steps_of_several_lengths_are_refused_and_empty_ones_read(tmp_path, encoding):
+    features = tfds_features.FeaturesDict(
+        {"steps": tfds_features.Dataset({"x": Tensor(shape=(None, 2), dtype=np.float32, encoding=encoding)})}
+    )
+    rows = ([3, 3], [0, 0], [], [1, 3])
+    episodes = [{"steps": [{"x": np.ones((count, 2), np.float32)} for count in counts]} for counts in rows]
+    build = RldsBuild(write_build(tmp_path, "sample", features, {"train": episodes}))
+    read = list(episodes_of(build))
+    shapes = [episode.column("steps/x").shape for episode in read[:3]]
+    assert shapes == [(2, 3, 2), (2, 0, 2), (0, 0, 2)]
+    with pytest.raises(DataError, match=r"record 1: steps/x: expected float32 \(None, 2\) a step, got 2 of \["):
+        read[3].column("steps/x")
+
+
 def test_undecodable_pictures_and_records(tmp_path):
     build = RldsBuild(write(tmp_path))
     with pytest.raises(DataError, match=r"shard 7: record: expected a tf\.train\.Example"):

@@ -95,12 +95,17 @@ class RldsEpisode:
         try:
             if _is_bytes(feature):
                 unzip = zlib.decompress if feature._encoding == Encoding.ZLIB else bytes
-                array = np.frombuffer(b"".join(unzip(value) for value in values), dtype.newbyteorder("<"))
+                parts = [unzip(value) for value in values]
+                # Put together, steps of several lengths could still fill the shape.
+                if len(parts) != rows or len(set(map(len, parts))) > 1:
+                    raise ValueError(f"{len(parts)} of {sorted(set(map(len, parts)))} bytes")
+                array = np.frombuffer(b"".join(parts), dtype.newbyteorder("<"))
             else:
                 array = np.fromiter(values, np.int64 if dtype.kind in "iub" else np.float32, count=len(values))
             array = array.astype(dtype, copy=False)
-            # A dimension of -1 cannot be told from no elements.
-            array = array.reshape(shape) if array.size else np.zeros([max(size, 0) for size in shape], dtype)
+            # A dimension of -1 cannot be told from no elements; without one, too few of them are an error.
+            open_and_empty = not array.size and -1 in shape
+            array = np.zeros([max(size, 0) for size in shape], dtype) if open_and_empty else array.reshape(shape)
         except (ValueError, zlib.error) as error:
             raise DataError(self.where, path, f"{dtype} {feature.shape} a step", str(error), _FIX) from error
         return array if path.startswith(f"{STEPS}/") else array[0]
