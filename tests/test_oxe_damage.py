@@ -1,6 +1,7 @@
 """Every kind of damage to RLDS builds: an error that names file and record, or, with skip_bad, left out and listed."""
 
 import random
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,6 +214,25 @@ def test_damage_is_named_and_left_out_only_on_request(tmp_path, capsys, kind):
     prepare(skipping)
     printed = capsys.readouterr().out
     assert f"left out: {loader.left_out[0][0]}: {loader.left_out[0][1]}" in printed
+
+
+@pytest.mark.parametrize("file_format", ["array_record", "parquet"])
+@pytest.mark.parametrize("damage", ["cut short", "empty"])
+def test_damaged_shards_of_other_containers_are_named_and_left_out(tmp_path, file_format, damage):
+    write_fixture(tmp_path, STRETCH, EPISODES, STEPS, file_format=file_format)
+    write_fixture(tmp_path / "other", STRETCH, EPISODES - 2, STEPS, file_format=file_format)
+    path, other = (RldsBuild(folder / STRETCH).shards("train")[1].path for folder in (tmp_path, tmp_path / "other"))
+    whole = Path(path).read_bytes()
+    Path(path).write_bytes({"cut short": whole[:-5], "empty": b""}.get(damage, Path(other).read_bytes()))
+    build, dataset = RldsBuild(tmp_path / STRETCH), get_dataset(STRETCH)
+    message = (
+        "records: expected 3 .*got 2" if damage == "of another build" else f"file: expected an? {file_format} file"
+    )
+    with pytest.raises(DataError, match=f"{SHARD}: {message}"):
+        load_index(build, dataset, config_for(tmp_path, STRETCH), progress=False)
+    index = load_index(build, dataset, config_for(tmp_path, STRETCH, skip_bad=True), progress=False)
+    assert len(index.samples) == (5 if damage == "of another build" else 3)
+    assert len(index.left_out) == 1
 
 
 @pytest.mark.parametrize("change", ["overwritten", "cut short"])

@@ -127,6 +127,13 @@ class ArrayRecordFile:
             raise DataError(path, "file", "a local file", "none", "copy the build to a local disk")
         self.path = path
         self._reader = array_record_module.ArrayRecordReader(path, options="readahead_buffer_size:0")
+        try:
+            if not self._reader.ok():
+                # A damaged file has no records, and only closing it tells why.
+                self._reader.close()
+        except RuntimeError as error:
+            got = str(error) or "a truncated one"
+            raise DataError(path, "file", "an array_record file", got, "copy the file again") from error
 
     def __len__(self) -> int:
         return int(self._reader.num_records())
