@@ -217,7 +217,7 @@ def test_damage_is_named_and_left_out_only_on_request(tmp_path, capsys, kind):
 
 
 @pytest.mark.parametrize("file_format", ["array_record", "parquet"])
-@pytest.mark.parametrize("damage", ["cut short", "empty"])
+@pytest.mark.parametrize("damage", ["cut short", "empty", "of another build"])
 def test_damaged_shards_of_other_containers_are_named_and_left_out(tmp_path, file_format, damage):
     write_fixture(tmp_path, STRETCH, EPISODES, STEPS, file_format=file_format)
     write_fixture(tmp_path / "other", STRETCH, EPISODES - 2, STEPS, file_format=file_format)

@@ -93,10 +93,12 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
             _leave_out(error, f"{shard.path} (all {shard.records} records)", left_out, config)
             offsets.append(np.zeros(1, np.int64))
             continue
+        whole = usable == shard.records
         if isinstance(records, TFRecordFile):
             offsets.append(records.offsets)
-            if not records.is_whole or usable != shard.records:
-                _leave_out(_truncated(shard, usable), shard.path, left_out, config)
+            whole = whole and records.is_whole
+        if not whole:
+            _leave_out(_truncated(shard, usable), shard.path, left_out, config)
         for record in range(usable):
             where = f"{shard.path}, record {record}"
             bar.update()
