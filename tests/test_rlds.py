@@ -217,6 +217,22 @@ def test_features_that_do_not_fit_the_records(tmp_path, change, message):
         next(episodes_of(RldsBuild(folder))).column("steps/action/world_vector")
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("pythonClassName", "my_robot.features.Gripper", "my_robot"),
+        ("dtypeOfTomorrow", "float4", "dtypeOfTomorrow"),
+    ],
+)
+def test_features_that_tfds_does_not_know(tmp_path, name, value, message):
+    folder = write(tmp_path)
+    features = json.loads((folder / "features.json").read_text())
+    features["content"]["features"]["success"][name] = value
+    (folder / "features.json").write_text(json.dumps(features))
+    with pytest.raises(DataError, match=rf"features\.json: features: expected the features of a tfds.*{message}"):
+        RldsBuild(folder)
+
+
 def test_missing_and_unknown_features(tmp_path):
     folder = write(tmp_path)
     build = RldsBuild(folder)

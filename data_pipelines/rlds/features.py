@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from google.protobuf.json_format import ParseError
 from google.protobuf.message import DecodeError
 from tensorflow_datasets.core.features import (
     Dataset,
@@ -35,10 +36,9 @@ def parse_features(json_value: Any, where: object) -> dict[str, FeatureConnector
     """The leaves of a parsed ``features.json`` by their path, as ``steps/observation/image``."""
     try:
         features = FeatureConnector.from_json(json_value)
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
-        raise DataError(
-            where, "features", "the features of a tfds build", str(error), "copy the build again"
-        ) from error
+    except (KeyError, ValueError, TypeError, AttributeError, ImportError, ParseError) as error:
+        fix = "copy the build again, or install the tensorflow_datasets that wrote it"
+        raise DataError(where, "features", "the features of a tfds build", str(error), fix) from error
     return dict(_leaves(features, ""))
 
 
