@@ -80,6 +80,14 @@ def set_number(path, place, value):
     return change
 
 
+def zeros(path):
+    def change(features):
+        values = features[path].float_list.value
+        values[:] = [0.0] * len(values)
+
+    return change
+
+
 def as_whole_numbers(features):
     numbers = [int(value) for value in features["steps/action"].float_list.value]
     features["steps/action"].int64_list.value[:] = numbers
@@ -104,6 +112,8 @@ def set_bytes(path, value):
 
 
 FRACTAL, STRETCH = "fractal20220817_data", "cmu_stretch"
+MANISKILL = "maniskill_dataset_converted_externally_to_rlds"
+EXTRINSIC = "steps/observation/main_camera_extrinsic_cv"
 SHARD, RECORD = "00001-of-00002", "00000-of-00002, record 1"
 # name: (dataset, damage, the place that is named, the message, usable episodes left)
 DAMAGE = {
@@ -172,6 +182,27 @@ DAMAGE = {
         in_record(lambda features: features[IMAGE].bytes_list.value.pop()),
         RECORD,
         f"{IMAGE}: expected 7 values, got 6",
+        5,
+    ),
+    "missing depth": (
+        MANISKILL,
+        in_record(lambda features: features.pop("steps/observation/depth")),
+        RECORD,
+        "steps/observation/depth: expected to be present, got nothing",
+        5,
+    ),
+    "nan camera": (
+        MANISKILL,
+        in_record(set_number(EXTRINSIC, 17, np.nan)),
+        RECORD,
+        f"{EXTRINSIC}: expected finite numbers, got 1 NaN or infinite, the first at step 1",
+        5,
+    ),
+    "camera of zeros": (
+        MANISKILL,
+        in_record(zeros(EXTRINSIC)),
+        RECORD,
+        f"{EXTRINSIC}: expected matrices that can be inverted, got another",
         5,
     ),
     "text that is none": (

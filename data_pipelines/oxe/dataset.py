@@ -27,6 +27,22 @@ class Depth:
     intrinsics: str
     camera_from_world: str
 
+    def cameras(self, episode: RldsEpisode) -> tuple[np.ndarray, np.ndarray]:
+        """Intrinsics (T, 3, 3) and world_from_camera (T, 4, 4) of an episode of T steps, float32.
+
+        Raises DataError where a matrix is missing, misshapen, not finite or cannot be inverted.
+        """
+        paths = [f"steps/observation/{name}" for name in (self.intrinsics, self.camera_from_world)]
+        intrinsics, camera_from_world = (episode.column(path) for path in paths)
+        require_finite(intrinsics, episode.where, paths[0])
+        require_finite(camera_from_world, episode.where, paths[1])
+        try:
+            world_from_camera = np.linalg.inv(camera_from_world.astype(np.float64))
+        except np.linalg.LinAlgError as error:
+            fix = "leave the episode out with --skip-bad"
+            raise DataError(episode.where, paths[1], "matrices that can be inverted", "another", fix) from error
+        return intrinsics, world_from_camera.astype(np.float32)
+
 
 @dataclasses.dataclass(frozen=True)
 class OxeDataset:

@@ -143,9 +143,12 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
 
 
 def check_pictures(episode: Any, dataset: OxeDataset) -> None:
-    """Raises DataError unless the view that is trained on has a picture for every step."""
+    """Raises DataError unless every step has the picture that is trained on, and the depth and camera if there are."""
     view = main_view(dataset)
     episode.encoded(f"steps/observation/{dataset.images[view]}")
+    if dataset.depth is not None:
+        episode.encoded(f"steps/observation/{dataset.depth.key}")
+        dataset.depth.cameras(episode)
 
 
 def main_view(dataset: OxeDataset) -> Any:

@@ -101,14 +101,10 @@ class OpenDataset:
         depth = self.dataset.depth
         if depth is None:
             return []
-        intrinsics = episode.column(f"steps/observation/{depth.intrinsics}")
-        poses = np.linalg.inv(episode.column(f"steps/observation/{depth.camera_from_world}").astype(np.float64))
+        intrinsics, poses = depth.cameras(episode)
         path = f"steps/observation/{depth.key}"
         encoded, kind = list(episode.encoded(path)), image_format(self.build.features[path])
-        return [
-            Camera(intrinsics[i], poses[i].astype(np.float32), depth.unit, encoded[i], kind)
-            for i in range(episode.num_steps)
-        ]
+        return [Camera(intrinsics[i], poses[i], depth.unit, encoded[i], kind) for i in range(episode.num_steps)]
 
 
 class Stream:
