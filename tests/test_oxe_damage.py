@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tensorflow_datasets.core.features import Tensor
 from tensorflow_datasets.proto import tf_example_pb2
 
 from data_pipelines.oxe.__main__ import prepare
@@ -245,6 +246,26 @@ def test_damage_is_named_and_left_out_only_on_request(tmp_path, capsys, kind):
     prepare(skipping)
     printed = capsys.readouterr().out
     assert f"left out: {loader.left_out[0][0]}: {loader.left_out[0][1]}" in printed
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "width", "message"),
+    [
+        (STRETCH, "steps/action", 6, "steps/action: expected at least 7 columns, got 6"),
+        (FRACTAL, "steps/observation/base_pose_tool_reached", 6, "pose: expected 7 columns, got 6"),
+        (FRACTAL, "steps/action/rotation_delta", 4, "action: expected 6 columns, got 7"),
+        ("viola", "steps/observation/ee_states", 15, "pose: expected 16 columns, got 15"),
+    ],
+)
+def test_columns_of_another_version_are_refused(tmp_path, name, path, width, message):
+    write_fixture(tmp_path, name, 1, STEPS, shards=1)
+    build = RldsBuild(tmp_path / name)
+    (record,) = records_of(tmp_path, name)
+    example = tf_example_pb2.Example.FromString(record)
+    example.features.feature[path].float_list.value[:] = np.ones(build.parse(record, "").num_steps * width)
+    build.features[path] = Tensor(shape=(width,), dtype=np.float32)
+    with pytest.raises(DataError, match=f"shard 7, record 3: {message}; is this the version"):
+        get_dataset(name).motion(build.parse(example.SerializeToString(), "shard 7, record 3"))
 
 
 @pytest.mark.parametrize("file_format", ["array_record", "parquet"])

@@ -9,7 +9,7 @@ Axes: T steps of an episode, A arms, J joints.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NoReturn
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -67,11 +67,17 @@ class Arm:
 
 
 def read(path: str, start: int | None = None, stop: int | None = None) -> Column:
-    """Columns start to stop of a feature of the steps, float64 (T, n). Raises DataError where one is not finite."""
+    """Columns start to stop of a feature of the steps, float64 (T, n).
+
+    Raises DataError where the feature has fewer columns, or one is not finite.
+    """
 
     def column(episode: RldsEpisode) -> np.ndarray:
         values = episode.column(f"steps/{path}").astype(np.float64)
-        values = values.reshape(len(values), -1)[:, start:stop]
+        values = values.reshape(len(values), -1)
+        if stop is not None and values.shape[1] < stop:
+            _refuse_width(f"at least {stop}", values, episode.where, f"steps/{path}")
+        values = values[:, start:stop]
         # Here and not at the end: what is made of a column may not show that a number was missing.
         require_finite(values, episode.where, f"steps/{path}")
         return values
@@ -88,19 +94,26 @@ def require_finite(values: np.ndarray, where: str, name: str) -> None:
     raise DataError(where, name, "finite numbers", got, "leave the episode out with --skip-bad")
 
 
+def _refuse_width(expected: str, values: np.ndarray, where: str, name: str) -> NoReturn:
+    fix = "is this the version of the dataset that the registry describes?"
+    raise DataError(where, name, f"{expected} columns", str(values.shape[1]), fix)
+
+
 def join(*columns: Column) -> Column:
     """Columns side by side."""
     return lambda episode: np.concatenate([column(episode) for column in columns], axis=1)
 
 
 def pose(column: Column, rotation: RotationKind, scale: float = 1.0, turn: float = 1.0) -> Column:
-    """Position (3, or fewer where the rest is zero) and then rotation as (T, 7); scale: metres a unit; turn: radians.
+    """Position (3, or without a rotation fewer: the rest is zero) and then rotation as (T, 7).
 
+    scale: metres a unit. turn: radians a unit.
     "matrix" takes a flattened 4 x 4 pose, by rows or by columns: whichever leaves 0 0 0 1 at the end.
     """
 
     def column_of(episode: RldsEpisode) -> np.ndarray:
         values = column(episode)
+        _require_width(values, rotation, episode.where, "pose")
         if rotation == "matrix":
             matrix = _pose_matrix(values.reshape(-1, 4, 4), episode)
             position, turned = matrix[:, :3, 3], Rotation.from_matrix(matrix[:, :3, :3])
@@ -116,10 +129,14 @@ def pose(column: Column, rotation: RotationKind, scale: float = 1.0, turn: float
 
 
 def delta(column: Column, rotation: RotationKind, scale: float = 1.0, turn: float = 1.0) -> Column:
-    """Translation (up to 3) and then rotation of a step as (T, 6). scale, turn: metres and radians a unit."""
+    """Translation (3, or without a rotation fewer) and then rotation of a step as (T, 6).
+
+    scale, turn: metres and radians a unit.
+    """
 
     def column_of(episode: RldsEpisode) -> np.ndarray:
         values = column(episode)
+        _require_width(values, rotation, episode.where, "action")
         size = _ROTATION_SIZE[rotation]
         moved = np.zeros((len(values), 6))
         moved[:, : values.shape[1] - size] = values[:, : values.shape[1] - size] * scale
@@ -206,6 +223,13 @@ def as_rotation(values: np.ndarray, kind: RotationKind, turn: float, where: str)
 
 
 _ROTATION_SIZE = {"rpy": 3, "ypr": 3, "zxy": 3, "xyzw": 4, "wxyz": 4, "rotvec": 3, "yaw": 1, "none": 0}
+
+
+def _require_width(values: np.ndarray, rotation: RotationKind, where: str, name: str) -> None:
+    """Raises DataError unless values (T, n) can be a position and a rotation: those of another version often cannot."""
+    widths = (16,) if rotation == "matrix" else (1, 2, 3) if rotation == "none" else (3 + _ROTATION_SIZE[rotation],)
+    if values.shape[1] not in widths:
+        _refuse_width(" or ".join(map(str, widths)), values, where, name)
 
 
 def _pose_matrix(matrix: np.ndarray, episode: RldsEpisode) -> np.ndarray:
