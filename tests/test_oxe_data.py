@@ -3,9 +3,11 @@
 import dataclasses
 import json
 
+import fsspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tensorflow_datasets.proto import tf_example_pb2
 
 from data_pipelines.oxe.__main__ import vocabulary as write_words
 from data_pipelines.oxe.fixtures import known_episodes, write_fixture
@@ -19,7 +21,8 @@ from data_pipelines.oxe.registry import get_dataset
 from data_pipelines.oxe.targets import key_frames, make_targets
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
 from data_pipelines.records import DataError
-from data_pipelines.rlds.build import RldsBuild
+from data_pipelines.rlds.build import RldsBuild, TFRecordFile
+from data_pipelines.rlds.tfrecord import write_records
 from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
@@ -399,6 +402,31 @@ def test_statistics_are_kept_until_the_data_change(tmp_path, monkeypatch):
     elsewhere = dataclasses.replace(config, cache=str(tmp_path / "cache"))
     load_index(build, dataset, elsewhere, progress=False)
     assert list((tmp_path / "cache").glob("*.json"))
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_statistics_are_made_again_where_only_numbers_changed(tmp_path, remote):
+    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6, shards=1)
+    folder = tmp_path / "cmu_stretch" / "0.1.0"
+    config = config_for(tmp_path, ("cmu_stretch",), cache=str(tmp_path / "cache"))
+
+    def quantiles():
+        if remote:
+            fsspec.filesystem("memory").put(f"{folder}/", "/corrected/0.1.0/", recursive=True)
+        build = RldsBuild("memory://corrected" if remote else folder)
+        return np.asarray(load_index(build, get_dataset("cmu_stretch"), config, progress=False).quantiles)
+
+    before = quantiles()
+    shard = folder / "cmu_stretch-train.tfrecord-00000-of-00001"
+    records = TFRecordFile(str(shard))
+    examples = [tf_example_pb2.Example.FromString(records.read(number)) for number in range(len(records))]
+    for example in examples:
+        state = example.features.feature["steps/observation/state"].float_list.value
+        state[:] = [2 * number for number in state]
+    size = shard.stat().st_size
+    write_records(shard, [example.SerializeToString() for example in examples])
+    assert shard.stat().st_size == size
+    np.testing.assert_allclose(quantiles()[:, :3], 2 * before[:, :3], rtol=1e-5)
 
 
 def test_no_picture_is_decoded_for_statistics(tmp_path, monkeypatch):

@@ -173,15 +173,16 @@ def _fingerprint(build: RldsBuild, dataset: OxeDataset, config: OxeConfig) -> st
     parts = [
         str(VERSION),
         json.dumps(build.features_json, sort_keys=True),
-        repr([(shard.path, shard.records, _size(shard.path)) for shard in build.shards(config.split)]),
+        repr([(shard.path, shard.records, _stamp(shard.path)) for shard in build.shards(config.split)]),
         *(Path(str(module.__file__)).read_text() for module in code),
         repr((dataset.name, config.split, config.target, config.horizon, config.skip_bad)),
     ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def _size(path: str) -> int | None:
-    return files.size_of(path) if files.exists(path) else None
+def _stamp(path: str) -> tuple[int, float | None] | None:
+    # The size alone stays the same where only numbers were corrected.
+    return (files.size_of(path), files.written(path)) if files.exists(path) else None
 
 
 def _cache_path(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, key: str) -> Path:

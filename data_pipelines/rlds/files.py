@@ -61,6 +61,17 @@ def size_of(path: str) -> int:
     return int(file_system.size(name))
 
 
+def written(path: str) -> float | None:
+    """When a file was last written, in seconds since 1970; None where its file system does not tell."""
+    if not is_remote(path):
+        return Path(path).stat().st_mtime
+    file_system, name = fsspec.core.url_to_fs(path)
+    try:
+        return file_system.modified(name).timestamp()
+    except NotImplementedError:
+        return None
+
+
 def folders_in(path: str) -> list[str]:
     """The names of the folders in a folder, sorted; empty where there is no such folder."""
     if not is_remote(path):
