@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 
 import fsspec
 import numpy as np
@@ -427,6 +428,21 @@ def test_statistics_are_made_again_where_only_numbers_changed(tmp_path, remote):
     write_records(shard, [example.SerializeToString() for example in examples])
     assert shard.stat().st_size == size
     np.testing.assert_allclose(quantiles()[:, :3], 2 * before[:, :3], rtol=1e-5)
+
+
+def test_processes_of_the_same_number_may_write_the_index_at_once(tmp_path, monkeypatch):
+    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6)
+    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
+    replace = os.replace
+
+    def meanwhile(source, target):
+        monkeypatch.setattr("os.replace", replace)
+        load_index(build, dataset, config_for(tmp_path), progress=False)
+        replace(source, target)
+
+    monkeypatch.setattr("os.replace", meanwhile)
+    assert len(load_index(build, dataset, config_for(tmp_path), progress=False).samples) == 2
+    assert len(list((tmp_path / "cmu_stretch" / "0.1.0").glob("dsvla_index_*"))) == 1
 
 
 def test_no_picture_is_decoded_for_statistics(tmp_path, monkeypatch):

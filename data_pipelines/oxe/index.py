@@ -8,6 +8,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,8 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
         fix = "choose another split, or look at its records" + (f" ({reasons})" if reasons else "")
         raise DataError(build.folder, f"split {config.split}", "at least one usable episode", "none", fix)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(f".{os.getpid()}.partial")
+    # Not the process's number: it is the same in two containers that share a disk.
+    temporary = path.with_suffix(f".{uuid.uuid4().hex}.partial")
     temporary.write_text(json.dumps(_pack(index)) + "\n")
     os.replace(temporary, path)
     return index
