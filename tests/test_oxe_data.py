@@ -153,6 +153,15 @@ def test_processes_share_out_the_one_stream(folder):
     assert not (records[0] & records[1]) | (records[1] & records[2]) | (records[0] & records[2])
 
 
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs Linux's /proc")
+def test_no_file_stays_open(folder):
+    before = len(os.listdir("/proc/self/fd"))
+    loader = make(folder, threads=0)
+    for _ in range(20):
+        next(loader)
+    assert len(os.listdir("/proc/self/fd")) <= before
+
+
 def test_proportions_are_the_weights_times_the_sizes(folder):
     source = MixtureSource(config_for(folder), seed=0, progress=False)
     count = 4000

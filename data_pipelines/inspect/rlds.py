@@ -23,7 +23,7 @@ from data_pipelines.oxe.scale import HIGH, LOW, MixtureScale
 from data_pipelines.oxe.targets import why_unsupported
 from data_pipelines.records import DataError, Frame
 from data_pipelines.rlds import files
-from data_pipelines.rlds.build import RecordFile, RldsBuild
+from data_pipelines.rlds.build import RldsBuild
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.displacement import displace
 from dsvla_jax.encoding.encode import EncodingConfig
@@ -121,9 +121,8 @@ def _known(dataset: OxeDataset) -> Table:
 def _motions(opened: OpenDataset) -> list[Motion]:
     """Of some evenly spaced usable episodes."""
     numbers = np.unique(np.linspace(0, len(opened.index.samples) - 1, LOOKED_AT).astype(int))
-    open_files: dict[int, RecordFile] = {}
     bar = tqdm(numbers, unit="episode", desc="statistics", leave=False)
-    return [opened.dataset.motion(opened.parse(int(number), open_files)) for number in bar]
+    return [opened.dataset.motion(opened.parse(int(number))) for number in bar]
 
 
 def _counts(opened: OpenDataset, motions: Sequence[Motion]) -> Table:
@@ -158,9 +157,8 @@ def _section(
     opened: OpenDataset, number: int, encoding: EncodingConfig, scale: MixtureScale | None
 ) -> tuple[Section, Frame | None]:
     """One episode; and its first frame where it has a calibrated camera."""
-    open_files: dict[int, RecordFile] = {}
-    episode = opened.parse(number, open_files)
-    samples = opened.read(number, open_files)
+    episode = opened.parse(number)
+    samples = opened.read(number)
     chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_STRIP_FRAMES).round().astype(int))
     frames = [_frame(samples[i], i, opened.config) for i in chosen]
     pictures = [frame["rgb"] if samples[0].camera is None else draw_frame(frame) for frame in frames]

@@ -4,6 +4,7 @@ import dataclasses
 import operator
 import threading
 from collections.abc import Sequence
+from contextlib import closing
 from typing import SupportsIndex
 
 import grain
@@ -15,7 +16,7 @@ from data_pipelines.oxe.order import BlockOrder, deal, schedule
 from data_pipelines.oxe.registry import get_dataset, get_mixture
 from data_pipelines.oxe.targets import Targets, make_targets, why_unsupported
 from data_pipelines.rlds import files
-from data_pipelines.rlds.build import RecordFile, RldsBuild
+from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.features import ImageFormat, RldsEpisode, image_format
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.errors import UserError
@@ -58,21 +59,19 @@ class OpenDataset:
         self.build, self.dataset, self.config = build, dataset, config
         self.view = main_view(dataset)
         self.index: Index = load_index(self.build, dataset, config, progress)
+        self._shards = build.shards(config.split)
 
-    def parse(self, episode: int, open_files: dict[int, RecordFile]) -> RldsEpisode:
-        """The usable episode of that number as it is stored. open_files: by shard, a few; kept up to date."""
+    def parse(self, episode: int) -> RldsEpisode:
+        """The usable episode of that number as it is stored."""
         shard, record = int(self.index.shard[episode]), int(self.index.record[episode])
-        if shard not in open_files:
-            while len(open_files) >= 4:
-                open_files.pop(next(iter(open_files))).close()
-            offsets = None if self.index.offsets is None else self.index.offsets[shard]
-            open_files[shard] = self.build.open_shard(self.build.shards(self.config.split)[shard], offsets)
-        where = f"{self.index.shards[shard]}, record {record}"
-        return self.build.parse(open_files[shard].read(record), where)
+        offsets = None if self.index.offsets is None else self.index.offsets[shard]
+        # Opened anew, which is quick: over streams and datasets kept files would be more than a process may have.
+        with closing(self.build.open_shard(self._shards[shard], offsets)) as records:
+            return self.build.parse(records.read(record), f"{self.index.shards[shard]}, record {record}")
 
-    def read(self, episode: int, open_files: dict[int, RecordFile]) -> list[EncodedSample]:
+    def read(self, episode: int) -> list[EncodedSample]:
         """All samples of an episode."""
-        parsed = self.parse(episode, open_files)
+        parsed = self.parse(episode)
         motion = self.dataset.motion(parsed)
         return self._samples(parsed, motion.instruction, make_targets(motion, self.dataset, self.config))
 
@@ -114,7 +113,6 @@ class Stream:
         self._source, self._episodes = source, episodes
         self._order = BlockOrder(source.index.samples[episodes], window, seed)
         self._blocks: dict[tuple[int, int], dict[int, list[EncodedSample]]] = {}
-        self._files: dict[int, RecordFile] = {}
         self._lock = threading.Lock()
 
     def sample(self, number: int) -> EncodedSample:
@@ -127,7 +125,7 @@ class Stream:
                 self._blocks[block] = {}
             loaded = self._blocks[block]
             if episode not in loaded:
-                loaded[episode] = self._source.read(int(self._episodes[episode]), self._files)
+                loaded[episode] = self._source.read(int(self._episodes[episode]))
             return loaded[episode][place]
 
 
