@@ -146,6 +146,13 @@ def test_urls(tmp_path):
     assert_as_written(RldsBuild("memory://bucket/sample"))
 
 
+@pytest.mark.parametrize(("url", "message"), [("missing://bucket/sample", "Install missingfs"), ("no://bucket", "no")])
+def test_urls_that_cannot_be_opened(url, message):
+    fsspec.register_implementation("missing", "missingfs.FileSystem", clobber=True, errtxt="Install missingfs")
+    with pytest.raises(DataError, match=f"{url}.*: address: expected a file system that is installed, got .*{message}"):
+        RldsBuild(url)
+
+
 def test_the_newest_version_is_taken(tmp_path):
     old = write(tmp_path)
     (old.parent / "0.10.0").mkdir()

@@ -29,14 +29,10 @@ def open_binary(path: str) -> BinaryIO:
     try:
         if not is_remote(path):
             return Path(path).open("rb")
-        file_system, name = fsspec.core.url_to_fs(path)
+        file_system, name = _file_system(path)
         return file_system.open(name, "rb")
     except FileNotFoundError as error:
         raise DataError(path, "file", "to be present", "no such file", "copy the whole build again") from error
-    except ImportError as error:
-        raise DataError(
-            path, "address", "a file system that is installed", str(error), "install the package it names"
-        ) from error
 
 
 def read_text(path: str) -> str:
@@ -49,7 +45,7 @@ def exists(path: str) -> bool:
     """Whether there is such a file or folder."""
     if not is_remote(path):
         return Path(path).exists()
-    file_system, name = fsspec.core.url_to_fs(path)
+    file_system, name = _file_system(path)
     return bool(file_system.exists(name))
 
 
@@ -57,7 +53,7 @@ def size_of(path: str) -> int:
     """Bytes of a file."""
     if not is_remote(path):
         return Path(path).stat().st_size
-    file_system, name = fsspec.core.url_to_fs(path)
+    file_system, name = _file_system(path)
     return int(file_system.size(name))
 
 
@@ -65,7 +61,7 @@ def written(path: str) -> float | None:
     """When a file was last written, in seconds since 1970; None where its file system does not tell."""
     if not is_remote(path):
         return Path(path).stat().st_mtime
-    file_system, name = fsspec.core.url_to_fs(path)
+    file_system, name = _file_system(path)
     try:
         return file_system.modified(name).timestamp()
     except NotImplementedError:
@@ -77,6 +73,15 @@ def folders_in(path: str) -> list[str]:
     if not is_remote(path):
         here = Path(path)
         return sorted(child.name for child in here.iterdir() if child.is_dir()) if here.is_dir() else []
-    file_system, name = fsspec.core.url_to_fs(path)
+    file_system, name = _file_system(path)
     entries: list[dict[str, Any]] = file_system.ls(name, detail=True) if file_system.isdir(name) else []
     return sorted(entry["name"].rstrip("/").rsplit("/", 1)[-1] for entry in entries if entry["type"] == "directory")
+
+
+def _file_system(path: str) -> tuple[Any, str]:
+    """What fsspec opens a URL with, and the name that it knows the file by."""
+    try:
+        return fsspec.core.url_to_fs(path)
+    except (ImportError, ValueError) as error:
+        fix = "install the package it names, or correct the address"
+        raise DataError(path, "address", "a file system that is installed", str(error), fix) from error
