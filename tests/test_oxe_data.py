@@ -409,6 +409,10 @@ def test_statistics_are_kept_until_the_data_change(tmp_path, monkeypatch):
     assert other.quantiles is not None
     assert not np.array_equal(other.quantiles, first.quantiles)
     assert kept.exists()
+    text = kept.read_text()
+    kept.write_text(text[:100])
+    load_index(build, dataset, config, progress=False)
+    assert kept.read_text() == text
     elsewhere = dataclasses.replace(config, cache=str(tmp_path / "cache"))
     load_index(build, dataset, elsewhere, progress=False)
     assert list((tmp_path / "cache").glob("*.json"))

@@ -4,6 +4,7 @@ Only action and state columns are converted; no picture is decoded. The result i
 where the data, the dataset's description or the targets asked for have changed.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -63,7 +64,9 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
     key = _fingerprint(build, dataset, config)
     path = _cache_path(build, dataset, config, key)
     if path.is_file():
-        return _unpack(json.loads(path.read_text()))
+        # One that was cut short in copying is made again.
+        with contextlib.suppress(ValueError):
+            return _unpack(json.loads(path.read_text()))
     index = scan(build, dataset, config, progress)
     if not len(index.samples):
         reasons = "; ".join(f"{where}: {why}" for where, why in index.left_out[:2])
