@@ -383,6 +383,15 @@ def test_a_crop_takes_the_camera_along():
         assert before[1] == pytest.approx(shown_rows[v, u], abs=0.1)
 
 
+def test_exchanged_colours_are_put_right(tmp_path):
+    name = "utaustin_mutex"
+    write_fixture(tmp_path, name, episodes=9, steps=9)
+    loader = make(tmp_path, (name,), streams=1, threads=0, crop=1.0, colour_variation=0.0)
+    for row, picture in enumerate(next(loader)["rgb"]):
+        known, step = truth_of(name, loader.source[row].where)
+        np.testing.assert_allclose(picture.mean((0, 1)), known.colour(step), atol=3)
+
+
 def test_light_varies_colours_and_nothing_else():
     picture = np.random.default_rng(0).integers(0, 256, (8, 8, 3), np.uint8)
     same = vary_light(picture, np.random.default_rng(1), 0.0)

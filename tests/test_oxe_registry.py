@@ -1,9 +1,12 @@
 """Every dataset of the registry: a build with its own features and a known motion, read back as that motion."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_pipelines.oxe.dataset import View
 from data_pipelines.oxe.fixture_build import episode_of, features_of
 from data_pipelines.oxe.fixture_motion import known_episode
 from data_pipelines.oxe.fixtures import FIXTURES, write_fixture
@@ -24,6 +27,12 @@ CONSTANT_GRIPPER = {
     "berkeley_cable_routing": 0, "kaist_nonprehensile_converted_externally_to_rlds": 0, "uiuc_d3field": 0,
     "language_table": 1, "gnm_dataset": 0, "berkeley_gnm_recon": 0, "berkeley_gnm_cory_hall": 0,
     "berkeley_gnm_sac_son": 0,
+}  # fmt: skip
+# Of those that octo and openvla train on, by kpertsch/rlds_dataset_mod.
+EXCHANGED = {
+    "berkeley_autolab_ur5": ("wrist",), "utaustin_mutex": ("primary", "wrist"),
+    "stanford_hydra_dataset_converted_externally_to_rlds": ("primary", "wrist"),
+    "berkeley_fanuc_manipulation": ("primary", "wrist"),
 }  # fmt: skip
 JOINTS = {"berkeley_rpt_converted_externally_to_rlds", "roboset", "aloha_static_dataset", "aloha_dagger_dataset",
           "aloha_mobile_dataset"}  # fmt: skip
@@ -94,9 +103,11 @@ def test_the_known_motion_is_read_back(name, tmp_path):
                 turned = arm.rotation.as_rotvec() if len(truth.arms) == 2 else arm.rotation.as_quat()
                 written = np.concatenate([arm.position, turned], axis=1)
                 np.testing.assert_allclose(motion.joints[:, i], written[kept], atol=1e-5)
-        view = "primary" if "primary" in dataset.images else "wrist"
-        for step in dataset.steps(episode)[:2]:
-            picture = episode.image(f"steps/observation/{dataset.images[view]}", int(step))
+        views: tuple[View, ...] = ("primary", "wrist")
+        for step, view in itertools.product(dataset.steps(episode)[:2], views):
+            if view not in dataset.images:
+                continue
+            picture = episode.image(f"steps/observation/{dataset.images[view]}", int(step), view in dataset.bgr)
             assert np.abs(picture.reshape(-1, 3).astype(int) - truth.colour(int(step))).max() <= 3
 
 
@@ -104,6 +115,7 @@ def test_every_dataset_tells_a_hand_or_says_why_not():
     assert len(DATASETS) == 75 == len(FIXTURES)
     assert {name for name, dataset in DATASETS.items() if dataset.encoding == "joints"} == JOINTS
     assert {name for name, dataset in DATASETS.items() if dataset.encoding == "navigation"} == NAVIGATION
+    assert {name: dataset.bgr for name, dataset in DATASETS.items() if dataset.bgr} == EXCHANGED
     for name, dataset in DATASETS.items():
         assert dataset.has_pose or dataset.encoding == "joints" or all(arm.action for arm in dataset.arms), name
         assert dataset.source.startswith(("gs://", "https://"))

@@ -50,6 +50,7 @@ class OxeDataset:
 
     hz: steps a second. source: where it is published. images: observation keys of the views.
     language: path of the instruction in a step (text, or code points where `code_points`).
+    bgr: views whose pictures have red and blue exchanged.
     metric: positions and actions are metres and radians; False where the publisher does not say so, or they are scaled.
     frame: of `Arm.action`. first: steps left out at the start. stride: every how many steps one is kept.
     keep: which episodes are used. notes: traps, and how each is handled.
@@ -62,6 +63,7 @@ class OxeDataset:
     arms: tuple[Arm, ...]
     language: str = "language_instruction"
     code_points: bool = False
+    bgr: tuple[View, ...] = ()
     encoding: Encoding = "end_effector"
     metric: bool = True
     frame: Literal["base", "tool"] = "base"

@@ -2,7 +2,8 @@
 
 Facts: the column descriptions of each dataset's page of https://www.tensorflow.org/datasets/catalog; octo's and
 openvla's ``oxe/transforms`` for what the pages leave open. Where a page's words leave open whether an action is a pose
-or a displacement, the action is left out and displacements come from reached poses.
+or a displacement, the action is left out and displacements come from reached poses. Pictures with red and blue
+exchanged: ``prepare_open_x.sh`` of https://github.com/kpertsch/rlds_dataset_mod.
 """
 
 import numpy as np
@@ -29,6 +30,8 @@ _SCALED = "actions are scaled to -1..1: only reached poses are metric"
 _UNCLEAR = "whether the action is a pose or a displacement is unclear: displacements come from reached poses"
 _WRIST: dict[View, str] = {"primary": "image", "wrist": "wrist_image"}
 _IMAGE: dict[View, str] = {"primary": "image"}
+_BGR: tuple[View, ...] = ("primary", "wrist")
+_EXCHANGED = "red and blue are exchanged in all pictures"
 
 
 def _dataset(
@@ -48,7 +51,7 @@ def _opening(start: int) -> Column:
     return openness(read("action", start, start + 1), 0, 1)
 
 
-def _state_matrix(name: str, hz: float, **options) -> OxeDataset:
+def _state_matrix(name: str, hz: float, *further: str, **options) -> OxeDataset:
     """7 joints, the gripper's width and the hand's 4 x 4 pose as state (VIOLA's and LIBERO's robot stack)."""
     arm = Arm(
         gripper=_closing(7),
@@ -57,7 +60,7 @@ def _state_matrix(name: str, hz: float, **options) -> OxeDataset:
         gripper_state=openness(read("observation/state", 7, 8), 0, FRANKA_WIDTH),
     )
     notes = ("the state's last 16 columns are the hand's pose, which octo and openvla leave unread", _SCALED)
-    return _dataset(name, hz, _WRIST, arm, notes=notes, **options)
+    return _dataset(name, hz, _WRIST, arm, notes=(*notes, *further), **options)
 
 
 def _reached(
@@ -114,10 +117,11 @@ DATASETS = [
             pose=pose(join(read("observation/state", 0, 3), read("observation/state", 7, 10)), "rpy"),
             action=delta(read("action", 0, 6), "rpy"),
         ),
-        notes=("which of three gripper columns is the opening is not told: the last command stands for it",),
+        bgr=_BGR,
+        notes=("which of three gripper columns is the opening is not told: the last command stands for it", _EXCHANGED),
     ),
     _state_matrix(f"austin_buds_dataset{_SUFFIX}", 20),
-    _state_matrix("utaustin_mutex", 20),
+    _state_matrix("utaustin_mutex", 20, _EXCHANGED, bgr=_BGR),
     _dataset(
         f"nyu_franka_play_dataset{_SUFFIX}",
         3,
@@ -396,9 +400,11 @@ DATASETS = [
             action=delta(read("action"), "rpy"),
             gripper_state=openness(read("observation/state", 6, 7), 1, 0),
         ),
+        bgr=_BGR,
         notes=(
             "no gripper action: the next state stands for it, 1 being closed as octo and openvla have it",
             "end_effector_state is the pose, which octo and openvla leave unread",
+            _EXCHANGED,
         ),
     ),
     _dataset(

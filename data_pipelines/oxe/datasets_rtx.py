@@ -2,7 +2,8 @@
 
 Facts: the feature descriptions of https://www.tensorflow.org/datasets/catalog (each dataset's page);
 https://github.com/octo-models/octo and https://github.com/openvla/openvla (``oxe/transforms``) for what the pages leave
-open. Frequencies: the data sheet of https://robotics-transformer-x.github.io.
+open. Frequencies: the data sheet of https://robotics-transformer-x.github.io. Pictures with red and blue exchanged:
+``prepare_open_x.sh`` of https://github.com/kpertsch/rlds_dataset_mod, which octo's and openvla's copies went through.
 """
 
 import numpy as np
@@ -211,7 +212,12 @@ DATASETS = [
             ),
         ),
         LANGUAGE,
-        notes=("the gripper's action is a change: it holds until the next one", "depth comes without a camera"),
+        bgr=("wrist",),
+        notes=(
+            "the gripper's action is a change: it holds until the next one",
+            "depth comes without a camera",
+            "red and blue are exchanged in the wrist's pictures",
+        ),
     ),
     OxeDataset(
         "toto",

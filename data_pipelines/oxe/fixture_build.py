@@ -24,7 +24,8 @@ class Fixture:
     """How one dataset's build looks.
 
     steps, episode: ``path=kind`` separated by spaces; see `feature_of`. values: (left or only arm, right arm) -> what a
-    step holds, by path; further numbers are noise. episode_values: the same for the episode.
+    step holds, by path; further numbers are noise. episode_values: the same for the episode. bgr: names of the pictures
+    that have red and blue exchanged.
     """
 
     steps: str
@@ -33,6 +34,7 @@ class Fixture:
     arms: int = 1
     episode: str = "episode_metadata/file_path=t"
     episode_values: Callable[[], Values] = dict
+    bgr: tuple[str, ...] = ()
 
 
 def feature_of(kind: str) -> Any:
@@ -96,7 +98,12 @@ def episode_of(fixture: Fixture, known: KnownEpisode) -> Values:
     def step(place: int) -> Values:
         arms = [StepOf(arm, place, rng) for arm in known.arms]
         written = {**_common(known, place), **fixture.values(arms[0], arms[-1])}
-        return _nested({path: _value(kind, written.get(path), known.colour(place), rng) for path, kind in spec.items()})
+        colour = known.colour(place)
+        red, green, blue = colour
+        colours = {f"observation/{name}": (blue, green, red) for name in fixture.bgr}
+        return _nested(
+            {path: _value(kind, written.get(path), colours.get(path, colour), rng) for path, kind in spec.items()}
+        )
 
     told = fixture.episode_values()
     episode = {path: _value(kind, told.get(path), (0, 0, 0), rng) for path, kind in _split(fixture.episode).items()}

@@ -1,5 +1,7 @@
 """Builds of `datasets_converted`: features as on each dataset's page of https://www.tensorflow.org/datasets/catalog."""
 
+import dataclasses
+
 import numpy as np
 
 from data_pipelines.oxe.fixture_build import TOLD, Fixture, Values
@@ -7,6 +9,7 @@ from data_pipelines.oxe.fixture_motion import StepOf
 
 _SUFFIX = "_converted_externally_to_rlds"
 _BOTH = "observation/image=J128x128 observation/wrist_image=J128x128"
+_BGR = ("image", "wrist_image")
 
 
 def _closing(s: StepOf) -> float:
@@ -97,9 +100,10 @@ FIXTURES = {
             "action": [*s.dp, *s.drpy, 1 - s.open],
             "observation/state": [*s.p, *s.xyzw, *s.rpy, *s.noise(17)],
         },
+        bgr=_BGR,
     ),
     f"austin_buds_dataset{_SUFFIX}": _STATE24,
-    "utaustin_mutex": _STATE24,
+    "utaustin_mutex": dataclasses.replace(_STATE24, bgr=_BGR),
     f"nyu_franka_play_dataset{_SUFFIX}": Fixture(
         f"{TOLD} action=15 observation/depth=128x128x1i observation/depth_additional_view=128x128x1i"
         " observation/image=J128x128 observation/image_additional_view=J128x128 observation/state=13",
@@ -270,6 +274,7 @@ FIXTURES = {
             "observation/end_effector_state": [*s.p, *s.xyzw],
             "observation/state": [*s.noise(6), 1 - s.was, *s.noise(6)],
         },
+        bgr=_BGR,
     ),
     "cmu_playing_with_food": Fixture(
         f"{TOLD} action=8 observation/finger_vision_1=J128x128 observation/image=J128x128 observation/state=8",

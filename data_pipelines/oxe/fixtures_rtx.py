@@ -131,6 +131,7 @@ FIXTURES = {
             "observation/robot_state": [*s.noise(6), *s.p, *s.xyzw, 1 - s.was, *s.noise(1)],
         },
         episode="",
+        bgr=("hand_image",),
     ),
     "toto": Fixture(
         f"{NAMED} {_ACTION} action/open_gripper=b action/terminate_episode=f observation/image=J480x640"

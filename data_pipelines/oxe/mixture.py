@@ -78,7 +78,8 @@ class OpenDataset:
     def _samples(self, episode: RldsEpisode, instruction: str, targets: Targets) -> list[EncodedSample]:
         path = f"steps/observation/{self.dataset.images[self.view]}"
         pictures, steps = list(episode.encoded(path)), self.dataset.steps(episode)
-        cameras, kind = self._cameras(episode), image_format(self.build.features[path])
+        cameras = self._cameras(episode)
+        kind = image_format(self.build.features[path], self.view in self.dataset.bgr)
         return [
             EncodedSample(
                 dataset=self.dataset.name,

@@ -127,10 +127,10 @@ class RldsEpisode:
         except UnicodeDecodeError as error:
             raise DataError(self.where, path, "UTF-8", str(error), _FIX) from error
 
-    def image(self, path: str, step: int) -> np.ndarray:
-        """One decoded image: its own dtype, (H, W, C)."""
+    def image(self, path: str, step: int, bgr: bool = False) -> np.ndarray:
+        """One decoded image: its own dtype, (H, W, C). bgr: as `ImageFormat` has it."""
         return decode_image(
-            self.encoded(path)[step], image_format(self._feature(path)), f"{self.where}, step {step}, {path}"
+            self.encoded(path)[step], image_format(self._feature(path), bgr), f"{self.where}, step {step}, {path}"
         )
 
     def _feature(self, path: str) -> Any:
@@ -155,15 +155,19 @@ class RldsEpisode:
 
 @dataclasses.dataclass(frozen=True)
 class ImageFormat:
-    """What an Image feature says of its pictures. shape: (H, W, C), None where open."""
+    """What an Image feature says of its pictures. shape: (H, W, C), None where open.
+
+    bgr: whether blue was given for red when the picture was written, which no feature says.
+    """
 
     shape: tuple[int | None, ...]
     dtype: np.dtype
+    bgr: bool = False
 
 
-def image_format(feature: Any) -> ImageFormat:
+def image_format(feature: Any, bgr: bool = False) -> ImageFormat:
     """The format of an Image feature."""
-    return ImageFormat(tuple(feature.shape), np.dtype(feature.np_dtype))
+    return ImageFormat(tuple(feature.shape), np.dtype(feature.np_dtype), bgr)
 
 
 def decode_image(data: bytes, kind: ImageFormat, where: object) -> np.ndarray:
@@ -172,7 +176,8 @@ def decode_image(data: bytes, kind: ImageFormat, where: object) -> np.ndarray:
     A float32 Image is a four-channel PNG whose bytes are the numbers', as tfds writes it.
     """
     colour = kind.shape[-1] == 3 and kind.dtype == np.uint8
-    flag = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION if colour else cv2.IMREAD_UNCHANGED
+    order = cv2.IMREAD_COLOR_BGR if kind.bgr else cv2.IMREAD_COLOR_RGB
+    flag = order | cv2.IMREAD_IGNORE_ORIENTATION if colour else cv2.IMREAD_UNCHANGED
     if not _is_whole(data):
         raise DataError(where, "image", "a whole JPEG or PNG", f"{len(data)} bytes without its end", _FIX)
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
