@@ -34,6 +34,9 @@ EXCHANGED = {
     "stanford_hydra_dataset_converted_externally_to_rlds": ("primary", "wrist"),
     "berkeley_fanuc_manipulation": ("primary", "wrist"),
 }  # fmt: skip
+# Versions in the bucket: tfds' rtx.py, and Open X-Embodiment's notebook for robo_net and language_table.
+VERSIONS = {"aloha_mobile": "0.0.1", "dobbe": "0.0.1", "fmb": "0.0.1", "robo_set": "0.0.1", "language_table": "0.0.1",
+            "robo_net": "1.0.0", "droid": "1.0.0"}  # fmt: skip
 JOINTS = {"berkeley_rpt_converted_externally_to_rlds", "roboset", "aloha_static_dataset", "aloha_dagger_dataset",
           "aloha_mobile_dataset"}  # fmt: skip
 NAVIGATION = {"gnm_dataset", "berkeley_gnm_recon", "berkeley_gnm_cory_hall", "berkeley_gnm_sac_son"}
@@ -109,6 +112,14 @@ def test_the_known_motion_is_read_back(name, tmp_path):
                 continue
             picture = episode.image(f"steps/observation/{dataset.images[view]}", int(step), view in dataset.bgr)
             assert np.abs(picture.reshape(-1, 3).astype(int) - truth.colour(int(step))).max() <= 3
+
+
+def test_sources_are_versions_that_are_published():
+    for dataset in DATASETS.values():
+        bucket, _, place = dataset.source.partition("gs://gresearch/robotics/")
+        if not bucket:
+            folder, version = place.split("/")
+            assert version == VERSIONS.get(folder, "0.1.0"), dataset.name
 
 
 def test_every_dataset_tells_a_hand_or_says_why_not():

@@ -35,9 +35,15 @@ _EXCHANGED = "red and blue are exchanged in all pictures"
 
 
 def _dataset(
-    name: str, hz: float, images: dict[View, str], *arms: Arm, notes: tuple[str, ...] = (), **options
+    name: str,
+    hz: float,
+    images: dict[View, str],
+    *arms: Arm,
+    notes: tuple[str, ...] = (),
+    published: str = "0.1.0",
+    **options,
 ) -> OxeDataset:
-    source = f"{BUCKET}/{name}/0.1.0"
+    source = f"{BUCKET}/{name}/{published}"
     return OxeDataset(name, hz, source, images, arms, notes=notes, **options)
 
 
@@ -249,6 +255,7 @@ DATASETS = [
             gripper_state=openness(read("observation/state", 4, 5), 0, 1),
         ),
         metric=False,
+        published="1.0.0",
         notes=(
             "the fourth column is yaw; octo and openvla put it where roll belongs",
             "states are scaled to each robot's workspace",

@@ -125,14 +125,14 @@ DATASETS = [
     ),
     _aloha(
         "aloha_mobile_dataset",
-        f"{BUCKET}/aloha_mobile/0.1.0",
+        f"{BUCKET}/aloha_mobile/0.0.1",
         {"primary": "cam_high", "wrist": "cam_right_wrist"},
         "the base's two last columns are left out",
     ),
     OxeDataset(
         "fmb_dataset",
         10,
-        f"{BUCKET}/fmb/0.1.0",
+        f"{BUCKET}/fmb/0.0.1",
         {"primary": "image_side_1", "secondary": "image_side_2", "wrist": "image_wrist_1"},
         (
             Arm(
@@ -147,7 +147,7 @@ DATASETS = [
     OxeDataset(
         "dobbe",
         3.75,
-        f"{BUCKET}/dobbe/0.1.0",
+        f"{BUCKET}/dobbe/0.0.1",
         {"wrist": "wrist_image"},
         (
             Arm(
@@ -162,7 +162,7 @@ DATASETS = [
     OxeDataset(
         "roboset",
         5,
-        f"{BUCKET}/robo_set/0.1.0",
+        f"{BUCKET}/robo_set/0.0.1",
         {"primary": "image_left", "secondary": "image_right", "wrist": "image_wrist"},
         (
             Arm(
