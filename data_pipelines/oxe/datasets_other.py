@@ -146,7 +146,7 @@ DATASETS = [
     ),
     OxeDataset(
         "dobbe",
-        3.75,
+        30,
         f"{BUCKET}/dobbe/0.0.1",
         {"wrist": "wrist_image"},
         (
@@ -157,7 +157,11 @@ DATASETS = [
                 gripper_state=openness(read("observation/gripper"), 0, 1),
             ),
         ),
-        notes=("wrist camera only; openvla uses it as the primary view",),
+        notes=(
+            "wrist camera only; openvla uses it as the primary view",
+            "every frame of the 30 Hz videos is a step (SudeepDasari/dobbe_rlds_dataset_builder); Dobb-E's policies run"
+            " at 3.75 Hz",
+        ),
     ),
     OxeDataset(
         "roboset",
