@@ -44,6 +44,7 @@ EVERY_FIFTH = slice(None, None, 5)
 KEPT_STEPS = {
     "bridge_orig": slice(1, None),
     "bridge_oxe": slice(1, None),
+    "iamlab_cmu_pickup_insert_converted_externally_to_rlds": slice(1, None),
     "berkeley_rpt_converted_externally_to_rlds": slice(None, None, 3),
     "aloha_static_dataset": EVERY_FIFTH,
     "aloha_dagger_dataset": EVERY_FIFTH,

@@ -20,6 +20,7 @@ from data_pipelines.oxe.motion import (
     join,
     openness,
     pose,
+    preceding,
     read,
 )
 from data_pipelines.rlds.features import RldsEpisode
@@ -381,10 +382,15 @@ DATASETS = [
         _WRIST,
         Arm(
             gripper=_opening(7),
-            pose=pose(read("action", 0, 7), "xyzw"),
+            pose=pose(preceding(read("action", 0, 7)), "wxyz"),
             gripper_state=openness(read("observation/state", 7, 8), 0, 1),
         ),
-        notes=("the action is a pose: it stands for the pose, since the state is joints only",),
+        first=1,
+        notes=(
+            "the action is the pose reached one step later (mohitsharma0690/rlds_dataset_builder): it stands for the"
+            " pose of the next step, since the state is joints only",
+            "the quaternion's real part is first; octo and openvla take it for the last",
+        ),
     ),
     _dataset(
         "uiuc_d3field",

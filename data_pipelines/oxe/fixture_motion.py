@@ -77,7 +77,8 @@ class StepOf:
     """One arm at one step, in every convention that a dataset of the registry writes.
 
     p, dp: position and displacement to the next step (zero at the last). xyzw, wxyz, rpy, ypr, zxy, rotvec, matrix: the
-    rotation; d before the name: that to the next step. open, was: commanded and measured. closing: 1, -1 or 0.
+    rotation; d before the name: that to the next step; next: that of the next step. open, was: commanded and measured.
+    closing: 1, -1 or 0.
     """
 
     def __init__(self, arm: KnownArm, step: int, rng: np.random.Generator):
@@ -92,7 +93,8 @@ class StepOf:
         before = self.open if step == 0 else float(arm.open[step - 1])
         self.closing = before - self.open
         self.next_was = float(arm.was[following])
-        self.next_rotvec = arm.rotation[following].as_rotvec()
+        self.next_p, self.next_rotvec = arm.position[following], arm.rotation[following].as_rotvec()
+        self.next_wxyz = np.roll(arm.rotation[following].as_quat(), 1)
 
     def noise(self, size: int) -> np.ndarray:
         """Columns that must not be read."""

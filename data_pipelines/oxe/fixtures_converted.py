@@ -256,7 +256,7 @@ FIXTURES = {
     f"iamlab_cmu_pickup_insert{_SUFFIX}": Fixture(
         f"{TOLD} action=8 observation/image=J360x640 observation/state=20 observation/wrist_image=J240x320",
         lambda s, _: {
-            "action": [*s.p, *s.xyzw, s.open],
+            "action": [*s.next_p, *s.next_wxyz, s.open],
             "observation/state": [*s.noise(7), s.was, *s.noise(12)],
         },
     ),

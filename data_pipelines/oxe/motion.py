@@ -200,6 +200,16 @@ def following(column: Column) -> Column:
     return column_of
 
 
+def preceding(column: Column) -> Column:
+    """(T, n): what the step before told; the first step tells its own."""
+
+    def column_of(episode: RldsEpisode) -> np.ndarray:
+        values = column(episode)
+        return np.concatenate([values[:1], values[:-1]])
+
+    return column_of
+
+
 def as_rotation(values: np.ndarray, kind: RotationKind, turn: float, where: str) -> Rotation:
     """(T, size of the kind) as rotations. rpy: about fixed x, y, z. ypr: yaw, pitch, roll. zxy: about fixed z, x, y."""
     match kind:
