@@ -32,6 +32,10 @@ _UNCLEAR = "whether the action is a pose or a displacement is unclear: displacem
 _WRIST: dict[View, str] = {"primary": "image", "wrist": "wrist_image"}
 _IMAGE: dict[View, str] = {"primary": "image"}
 _BGR: tuple[View, ...] = ("primary", "wrist")
+_WATCHED = (
+    "1 is closed, as thu-ml/RoboticsDiffusionTransformer found by watching episodes: octo and openvla keep it the wrong"
+    " way round"
+)
 _EXCHANGED = "red and blue are exchanged in all pictures"
 
 
@@ -321,13 +325,21 @@ DATASETS = [
         f"dlr_sara_pour{_SUFFIX}",
         10,
         "zxy",
-        notes=("angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",),
+        gripper=openness(read("action", 6, 7), 1, 0),
+        notes=(
+            "angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",
+            _WATCHED,
+        ),
     ),
     _reached(
         f"dlr_sara_grid_clamp{_SUFFIX}",
         10,
         "zxy",
-        notes=("angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",),
+        gripper=openness(read("action", 6, 7), 1, 0),
+        notes=(
+            "angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",
+            _WATCHED,
+        ),
     ),
     _reached(
         f"dlr_edan_shared_control{_SUFFIX}",

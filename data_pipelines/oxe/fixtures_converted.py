@@ -219,11 +219,11 @@ FIXTURES = {
     ),
     f"dlr_sara_pour{_SUFFIX}": Fixture(
         f"{TOLD} action=7 observation/image=J480x640 observation/state=6",
-        lambda s, _: {"action": [*s.noise(6), s.open], "observation/state": [*s.p, *s.zxy]},
+        lambda s, _: {"action": [*s.noise(6), 1 - s.open], "observation/state": [*s.p, *s.zxy]},
     ),
     f"dlr_sara_grid_clamp{_SUFFIX}": Fixture(
         f"{TOLD} action=7 observation/image=J480x640 observation/state=12",
-        lambda s, _: {"action": [*s.noise(6), s.open], "observation/state": [*s.p, *s.zxy, *s.noise(6)]},
+        lambda s, _: {"action": [*s.noise(6), 1 - s.open], "observation/state": [*s.p, *s.zxy, *s.noise(6)]},
     ),
     f"dlr_edan_shared_control{_SUFFIX}": Fixture(
         f"{TOLD} action=7 observation/image=J360x640 observation/state=7",
