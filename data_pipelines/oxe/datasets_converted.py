@@ -234,8 +234,13 @@ DATASETS = [
         10,
         "ypr",
         images={"primary": "image", "secondary": "image2", "wrist": "hand_image"},
+        gripper=openness(read("action", 6, 7), 1, 0),
         state="observation/end_effector_pose",
-        notes=("angles come as yaw, pitch, roll",),
+        notes=(
+            "angles come as yaw, pitch, roll",
+            "the gripper's action is the trigger of the controller (frt03/rlds_dataset_builder), which closes: octo and"
+            " openvla keep it the wrong way round",
+        ),
     ),
     _dataset(
         f"utokyo_xarm_bimanual{_SUFFIX}",

@@ -161,7 +161,7 @@ FIXTURES = {
     f"utokyo_xarm_pick_and_place{_SUFFIX}": Fixture(
         f"{TOLD} action=7 observation/end_effector_pose=6 observation/hand_image=J224x224 observation/image=J224x224"
         " observation/image2=J224x224 observation/joint_state=14 observation/joint_trajectory=21",
-        lambda s, _: {"action": [*s.noise(6), s.open], "observation/end_effector_pose": [*s.p, *s.ypr]},
+        lambda s, _: {"action": [*s.noise(6), 1 - s.open], "observation/end_effector_pose": [*s.p, *s.ypr]},
     ),
     f"utokyo_xarm_bimanual{_SUFFIX}": Fixture(
         f"{TOLD} action=14 observation/action_l=7 observation/action_r=7 observation/image=J256x256"
