@@ -82,13 +82,23 @@ def _reached(
     images: dict[View, str] | None = None,
     gripper: Column | None = None,
     state: str = "observation/state",
+    scale: float = 1.0,
     notes: tuple[str, ...] = (),
     **options,
 ) -> OxeDataset:
-    """Poses in the first six columns of the state; the command's pose columns are left out."""
+    """Poses in the first six columns of the state, of `scale` metres; the command's pose columns are left out."""
     gripper = _opening(6) if gripper is None else gripper
-    arm = Arm(gripper=gripper, pose=pose(read(state, 0, 6), rotation), gripper_state=gripper_state)
+    arm = Arm(gripper=gripper, pose=pose(read(state, 0, 6), rotation, scale), gripper_state=gripper_state)
     return _dataset(name, hz, images or _IMAGE, arm, notes=(_UNCLEAR, *notes), **options)
+
+
+def _pr2(name: str) -> OxeDataset:
+    measured = openness(read("observation/state", 6, 7), 0, 86)
+    notes = (
+        "positions and the gripper's width are millimetres, as thu-ml/RoboticsDiffusionTransformer reads them",
+        "which way the gripper's action goes is not told: the opening of the next step is the command",
+    )
+    return _reached(name, 10, "rpy", gripper=following(measured), gripper_state=measured, scale=1e-3, notes=notes)
 
 
 def _velocity_gripper(episode: RldsEpisode) -> np.ndarray:
@@ -227,8 +237,8 @@ DATASETS = [
         ),
         notes=("`state` is joints, which octo and openvla take for a pose: state_ee is the pose", _SCALED),
     ),
-    _reached(f"utokyo_pr2_opening_fridge{_SUFFIX}", 10, "rpy"),
-    _reached(f"utokyo_pr2_tabletop_manipulation{_SUFFIX}", 10, "rpy"),
+    _pr2(f"utokyo_pr2_opening_fridge{_SUFFIX}"),
+    _pr2(f"utokyo_pr2_tabletop_manipulation{_SUFFIX}"),
     _reached(
         f"utokyo_xarm_pick_and_place{_SUFFIX}",
         10,

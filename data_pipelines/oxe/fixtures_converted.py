@@ -48,8 +48,8 @@ def _pr2() -> Fixture:
     return Fixture(
         f"{TOLD} action=8 observation/image=J128x128 observation/state=7",
         lambda s, _: {
-            "action": [*s.noise(6), s.open, 0],
-            "observation/state": [*s.p, *s.rpy, *s.noise(1)],
+            "action": s.noise(8),
+            "observation/state": [*s.p * 1000, *s.rpy, 86 * s.was],
         },
     )
 
