@@ -101,6 +101,11 @@ def _pr2(name: str) -> OxeDataset:
     return _reached(name, 10, "rpy", gripper=following(measured), gripper_state=measured, scale=1e-3, notes=notes)
 
 
+def _finger_distance(episode: RldsEpisode) -> np.ndarray:
+    """Its largest value is that of thu-ml/RoboticsDiffusionTransformer."""
+    return openness(read("observation/state", 6, 7), 0, 6.03)(episode)
+
+
 def _velocity_gripper(episode: RldsEpisode) -> np.ndarray:
     return openness(read("observation/state", 6, 7), 0, FRANKA_WIDTH)(episode)
 
@@ -207,11 +212,16 @@ DATASETS = [
         3,
         _IMAGE,
         Arm(
-            gripper=_opening(3),
-            pose=pose(read("observation/state", 0, 6), "rpy"),
-            action=delta(read("action", 0, 3), "none", 1 / 3),
+            gripper=following(_finger_distance),
+            pose=pose(read("observation/state", 0, 6), "rpy", 0.1),
+            action=delta(read("action", 0, 3), "none"),
+            gripper_state=_finger_distance,
         ),
-        notes=("actions are velocities of the hand, which never turns: divided by the frequency",),
+        notes=(
+            "positions are decimetres: nicklashansen/rlds_dataset_builder divides the xArm's millimetres by 100",
+            "actions are velocities of the hand, which never turns, and a gripper's torque, both scaled to -1..1: only"
+            " reached poses are metric, and the fingers' distance of the next step is the command",
+        ),
     ),
     _dataset(
         f"austin_sailor_dataset{_SUFFIX}",

@@ -142,7 +142,7 @@ FIXTURES = {
     ),
     f"ucsd_pick_and_place_dataset{_SUFFIX}": Fixture(
         f"{TOLD} action=4 observation/image=J224x224 observation/state=7",
-        lambda s, _: {"action": [*s.dp * 3, s.open], "observation/state": [*s.p, *s.rpy, *s.noise(1)]},
+        lambda s, _: {"action": [*s.dp, *s.noise(1)], "observation/state": [*s.p * 10, *s.rpy, 6.03 * s.was]},
         kind="still",
         episode="episode_metadata/file_path=t episode_metadata/success=b episode_metadata/n_transitions=i",
     ),
