@@ -20,7 +20,7 @@ from dsvla_jax.errors import UserError
 NO_POSE = {
     "berkeley_cable_routing", "roboturk", "nyu_door_opening_surprising_effectiveness", "toto",
     "cmu_franka_exploration_dataset_converted_externally_to_rlds", "berkeley_rpt_converted_externally_to_rlds",
-    "imperialcollege_sawyer_wrist_cam", "cmu_playing_with_food", "cmu_play_fusion", "mujoco_manip", "roboset",
+    "imperialcollege_sawyer_wrist_cam", "cmu_play_fusion", "mujoco_manip", "roboset",
     "aloha_static_dataset", "aloha_dagger_dataset", "aloha_mobile_dataset",
 }  # fmt: skip
 CONSTANT_GRIPPER = {
@@ -28,11 +28,11 @@ CONSTANT_GRIPPER = {
     "language_table": 1, "gnm_dataset": 0, "berkeley_gnm_recon": 0, "berkeley_gnm_cory_hall": 0,
     "berkeley_gnm_sac_son": 0,
 }  # fmt: skip
-# Of those that octo and openvla train on, by kpertsch/rlds_dataset_mod.
+# Of those that octo and openvla train on, by kpertsch/rlds_dataset_mod; cmu_playing_with_food by its own builder.
 EXCHANGED = {
     "berkeley_autolab_ur5": ("wrist",), "utaustin_mutex": ("primary", "wrist"),
     "stanford_hydra_dataset_converted_externally_to_rlds": ("primary", "wrist"),
-    "berkeley_fanuc_manipulation": ("primary", "wrist"),
+    "berkeley_fanuc_manipulation": ("primary", "wrist"), "cmu_playing_with_food": ("primary", "wrist"),
 }  # fmt: skip
 # Versions in the bucket: tfds' rtx.py, and Open X-Embodiment's notebook for robo_net and language_table.
 VERSIONS = {"aloha_mobile": "0.0.1", "dobbe": "0.0.1", "fmb": "0.0.1", "robo_set": "0.0.1", "language_table": "0.0.1",

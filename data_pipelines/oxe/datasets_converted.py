@@ -461,9 +461,14 @@ DATASETS = [
         "cmu_playing_with_food",
         10,
         {"primary": "image", "wrist": "finger_vision_1"},
-        Arm(gripper=openness(read("action", -1), 0, 1), action=delta(read("action", 0, 7), "xyzw")),
-        metric=False,
-        notes=("the action's rotation is a quaternion", "the layout of its state is not published"),
+        Arm(gripper=openness(read("action", -1), 0, 1), pose=pose(read("action", 0, 7), "wxyz")),
+        bgr=_BGR,
+        notes=(
+            "the action is a pose, its quaternion's real part first (firephinx/rlds_dataset_builder): it stands for the"
+            " pose, since the state is forces only; the hand never turns",
+            "grasps and releases tell one pose for the whole episode, so that only presses move",
+            _EXCHANGED,
+        ),
     ),
     _dataset(
         "cmu_play_fusion",

@@ -277,8 +277,11 @@ FIXTURES = {
         bgr=_BGR,
     ),
     "cmu_playing_with_food": Fixture(
-        f"{TOLD} action=8 observation/finger_vision_1=J128x128 observation/image=J128x128 observation/state=8",
-        lambda s, _: {"action": [*s.dp, *s.dxyzw, s.open]},
+        f"{TOLD} action=8 observation/finger_vision_1=P480x640 observation/finger_vision_2=P480x640"
+        " observation/image=P480x640 observation/state=6",
+        lambda s, _: {"action": [*s.p, *s.wxyz, s.open]},
+        kind="still",
+        bgr=("image", "finger_vision_1", "finger_vision_2"),
     ),
     "cmu_play_fusion": Fixture(
         f"{TOLD} action=9 observation/image=J128x128 observation/state=8",
