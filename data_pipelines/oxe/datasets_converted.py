@@ -193,9 +193,14 @@ DATASETS = [
         f"cmu_franka_exploration_dataset{_SUFFIX}",
         10,
         {"primary": "highres_image"},
-        Arm(gripper=_opening(6), action=delta(read("action", 0, 6), "rpy")),
+        Arm(gripper=_opening(6), action=delta(read("action", 0, 3), "none")),
         metric=False,
-        notes=("no robot state; the units of actions are not told", "the last column is a flag"),
+        notes=(
+            "no robot state; the units of actions are not told",
+            "the angles are differences of z-y-z angles (russellmendonca/rlds_dataset_builder), from which no rotation"
+            " can be told: they are left out",
+            "the last column is a flag",
+        ),
     ),
     _dataset(
         f"ucsd_kitchen_dataset{_SUFFIX}",

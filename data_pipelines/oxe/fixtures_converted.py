@@ -134,7 +134,8 @@ FIXTURES = {
     ),
     f"cmu_franka_exploration_dataset{_SUFFIX}": Fixture(
         f"{TOLD} action=8 observation/highres_image=J480x640 observation/image=J64x64 structured_action=8",
-        lambda s, _: {"action": [*s.dp, *s.drpy, s.open, 0]},
+        lambda s, _: {"action": [*s.dp, *s.noise(3), s.open, 0]},
+        kind="still",
     ),
     f"ucsd_kitchen_dataset{_SUFFIX}": Fixture(
         f"{TOLD} action=8 observation/image=J480x640 observation/state=21",
