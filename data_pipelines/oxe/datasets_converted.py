@@ -284,7 +284,7 @@ DATASETS = [
         1,
         {"primary": "image", "secondary": "image1"},
         Arm(
-            gripper=_opening(4),
+            gripper=_closing(5),
             pose=pose(read("observation/state", 0, 4), "yaw"),
             action=delta(read("action", 0, 4), "yaw"),
             gripper_state=openness(read("observation/state", 4, 5), 0, 1),
@@ -293,6 +293,8 @@ DATASETS = [
         published="1.0.0",
         notes=(
             "the fourth column is yaw; octo and openvla put it where roll belongs",
+            "-1 opens and 1 closes in RoboNet's recorder (SudeepDasari/visual_foresight): octo and openvla keep it the"
+            " wrong way round",
             "states are scaled to each robot's workspace",
         ),
     ),

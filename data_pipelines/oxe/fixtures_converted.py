@@ -177,7 +177,7 @@ FIXTURES = {
     "robo_net": Fixture(
         f"{TOLD} action=5 observation/image=J240x320 observation/image1=J240x320 observation/image2=J240x320"
         " observation/state=5",
-        lambda s, _: {"action": [*s.dp, *s.dyaw, s.open], "observation/state": [*s.p, *s.yaw, s.was]},
+        lambda s, _: {"action": [*s.dp, *s.dyaw, _closing(s)], "observation/state": [*s.p, *s.yaw, s.was]},
         kind="yaw",
         episode="episode_metadata/file_path=t episode_metadata/robot=t",
     ),
