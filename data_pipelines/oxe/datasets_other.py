@@ -7,7 +7,7 @@ source; octo's and openvla's ``oxe/transforms``.
 import numpy as np
 
 from data_pipelines.oxe.dataset import OxeDataset, View
-from data_pipelines.oxe.motion import Arm, Column, constant, delta, join, openness, pose, read, settled
+from data_pipelines.oxe.motion import Arm, Column, constant, delta, following, join, openness, pose, read, settled
 
 BUCKET = "gs://gresearch/robotics"
 _NAVIGATION = ("navigation: left out of every mixture here",)
@@ -136,13 +136,20 @@ DATASETS = [
         {"primary": "image_side_1", "secondary": "image_side_2", "wrist": "image_wrist_1"},
         (
             Arm(
-                gripper=openness(read("action", 6, 7), 0, 1),
+                gripper=following(openness(read("observation/state_gripper_pose"), 1, 0)),
                 pose=pose(read("observation/eef_pose"), "xyzw"),
                 action=delta(read("action", 0, 6), "rpy"),
-                gripper_state=openness(read("observation/state_gripper_pose"), 0, 1),
+                gripper_state=openness(read("observation/state_gripper_pose"), 1, 0),
             ),
         ),
-        notes=("only reached poses are known to be metric", "depth comes without a camera", "tfds calls it fmb"),
+        notes=(
+            "the gripper's state is 1 when closed (https://huggingface.co/datasets/robot-lev/fmb_multi, and"
+            " thu-ml/RoboticsDiffusionTransformer); which way its action goes is not told: the next state is the"
+            " command",
+            "only reached poses are known to be metric",
+            "depth comes without a camera",
+            "tfds calls it fmb",
+        ),
     ),
     OxeDataset(
         "dobbe",

@@ -102,9 +102,9 @@ FIXTURES = {
         " observation/joint_vel=7 observation/length=s observation/object_id=u observation/primitive=s"
         " observation/shape_id=u observation/size=s observation/state_gripper_pose=f",
         lambda s, _: {
-            "action": [*s.dp, *s.drpy, s.open],
+            "action": [*s.dp, *s.drpy, *s.noise(1)],
             "observation/eef_pose": [*s.p, *s.xyzw],
-            "observation/state_gripper_pose": s.was,
+            "observation/state_gripper_pose": 1 - s.was,
         },
         episode="episode_metadata/episode_language_embedding=512 episode_metadata/episode_language_instruction=s"
         " episode_metadata/episode_task=s episode_metadata/file_path=s",
