@@ -484,10 +484,13 @@ DATASETS = [
         Arm(
             gripper=_opening(7),
             action=delta(read("action", 0, 7), "xyzw"),
-            gripper_state=openness(read("observation/state", 7, 8), 0, 1),
+            gripper_state=openness(read("observation/state", 7, 8), 0, 0.085),
         ),
         metric=False,
-        notes=("the rotation is a quaternion; octo and openvla take its tail, the gripper and a flag for rotation",),
+        notes=(
+            "the rotation is a quaternion; octo and openvla take its tail, the gripper and a flag for rotation",
+            "the gripper's state is its width, up to 85 mm as thu-ml/RoboticsDiffusionTransformer has it",
+        ),
     ),
     _dataset(
         "cmu_stretch",

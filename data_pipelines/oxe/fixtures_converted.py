@@ -286,7 +286,7 @@ FIXTURES = {
     ),
     "cmu_play_fusion": Fixture(
         f"{TOLD} action=9 observation/image=J128x128 observation/state=8",
-        lambda s, _: {"action": [*s.dp, *s.dxyzw, s.open, 0], "observation/state": [*s.noise(7), s.was]},
+        lambda s, _: {"action": [*s.dp, *s.dxyzw, s.open, 0], "observation/state": [*s.noise(7), 0.085 * s.was]},
     ),
     "cmu_stretch": Fixture(
         f"{TOLD} action=8 observation/image=J128x128 observation/state=4",
