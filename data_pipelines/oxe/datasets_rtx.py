@@ -33,9 +33,9 @@ _CLOSING = read("action/gripper_closedness_action")
 
 
 def _moved(hz: float | None = None) -> Column:
-    """world_vector and rotation_delta; velocities where a frequency is given."""
+    """world_vector and rotation_delta; velocities, whose rotation is a vector, where a frequency is given."""
     scale = 1.0 / hz if hz else 1.0
-    return delta(join(_VECTOR, _ROTATION), "rpy", scale, scale)
+    return delta(join(_VECTOR, _ROTATION), "rotvec" if hz else "rpy", scale, scale)
 
 
 def _succeeded(episode: RldsEpisode) -> bool:

@@ -9,9 +9,13 @@ _ACTION = "action/rotation_delta=3 action/world_vector=3"
 _BASE = "action/base_displacement_vector=2 action/base_displacement_vertical_rotation=1 action/terminate_episode=3i"
 
 
-def _moves(s: StepOf, rotation: bool = True, hz: float = 1.0) -> Values:
-    turned = {"action/rotation_delta": s.drpy * hz} if rotation else {}
-    return {"action/world_vector": s.dp * hz, **turned}
+def _moves(s: StepOf, rotation: bool = True) -> Values:
+    turned = {"action/rotation_delta": s.drpy} if rotation else {}
+    return {"action/world_vector": s.dp, **turned}
+
+
+def _velocities(s: StepOf, hz: float) -> Values:
+    return {"action/world_vector": s.dp * hz, "action/rotation_delta": s.drotvec * hz}
 
 
 def _bridge(s: StepOf, _: StepOf) -> Values:
@@ -92,7 +96,7 @@ FIXTURES = {
     "berkeley_cable_routing": Fixture(
         f"{NAMED} {_ACTION} action/terminate_episode=f observation/image=J128x128 observation/robot_state=7"
         " observation/top_image=J128x128 observation/wrist225_image=J128x128 observation/wrist45_image=J128x128",
-        lambda s, _: _moves(s, hz=10),
+        lambda s, _: _velocities(s, 10),
         kind="yaw",
         episode="",
     ),
@@ -104,8 +108,7 @@ FIXTURES = {
     ),
     "nyu_door_opening_surprising_effectiveness": Fixture(
         f"{NAMED} {_ACTION} action/gripper_closedness_action=1 action/terminate_episode=f observation/image=J720x960",
-        lambda s, _: {**_moves(s, hz=3), "action/gripper_closedness_action": [s.closing]},
-        kind="yaw",
+        lambda s, _: {**_velocities(s, 3), "action/gripper_closedness_action": [s.closing]},
         episode="",
     ),
     "viola": Fixture(
