@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import os
+from types import SimpleNamespace
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -19,6 +21,7 @@ from data_pipelines.oxe.mixture import MixtureSource
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.order import BlockOrder, deal, schedule
 from data_pipelines.oxe.registry import get_dataset
+from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.oxe.targets import key_frames, make_targets
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
 from data_pipelines.records import DataError
@@ -340,6 +343,17 @@ def test_the_scale_is_that_of_the_known_motion(folder):
     low, high = np.quantile(np.concatenate(moved), [0.01, 0.99], axis=0)
     np.testing.assert_allclose(scale_of(loader).low, low, atol=3e-4)
     np.testing.assert_allclose(scale_of(loader).high, high, atol=3e-4)
+
+
+def test_the_scale_is_not_that_of_the_rare_steps_of_what_mostly_stands_still():
+    known = SimpleNamespace(metric=True, name="known")
+    moves = np.random.default_rng(0).normal(size=(20_000, 6))
+    moves[:, 3:][np.random.default_rng(1).random((20_000, 3)) > 0.004] = 0
+    rows = np.quantile(moves, np.linspace(0, 1, 101), axis=0)
+    opened: Any = [SimpleNamespace(dataset=known, index=SimpleNamespace(quantiles=rows))]
+    scale = MixtureScale(opened, np.ones(1)).scale
+    for made, at in ((scale.low, 0.01), (scale.high, 0.99)):
+        np.testing.assert_allclose(made, np.quantile(moves, at, axis=0), atol=1e-6)
 
 
 def test_unscaled_data_are_stretched_to_the_metric_range(folder):

@@ -48,5 +48,8 @@ def _quantile(known: list[tuple[np.ndarray, float]], column: int, at: float) -> 
     """Of the distribution that mixes those given by quantiles (101, 6), each with its share."""
     points = np.unique(np.concatenate([rows[:, column] for rows, _ in known]))
     levels = np.linspace(0, 1, QUANTILES)
+    # Where many values are the same, the distribution jumps: what lies below and what has been passed differ.
+    below = sum(share * (1 - np.interp(-points, -rows[::-1, column], levels)) for rows, share in known)
     passed = sum(share * np.interp(points, rows[:, column], levels) for rows, share in known)
-    return float(np.interp(at, passed / sum(share for _, share in known), points))
+    jumps = np.stack([below, passed], axis=1).ravel() / sum(share for _, share in known)
+    return float(np.interp(at, jumps, np.repeat(points, 2)))
