@@ -17,6 +17,7 @@ from data_pipelines.oxe.motion import (
     constant,
     delta,
     following,
+    in_base,
     join,
     openness,
     pose,
@@ -110,6 +111,8 @@ def _velocity_gripper(episode: RldsEpisode) -> np.ndarray:
     return openness(read("observation/state", 6, 7), 0, FRANKA_WIDTH)(episode)
 
 
+_MANISKILL_POSE = pose(read("observation/tcp_pose"), "wxyz")
+
 DATASETS = [
     _dataset(
         f"stanford_kuka_multimodal_dataset{_SUFFIX}",
@@ -165,14 +168,15 @@ DATASETS = [
         _WRIST,
         Arm(
             gripper=openness(read("action", 6, 7), -1, 1),
-            pose=pose(read("observation/tcp_pose"), "wxyz"),
-            action=delta(read("action", 0, 6), "rotvec", 0.1, 0.1),
+            pose=_MANISKILL_POSE,
+            action=in_base(delta(read("action", 0, 6), "rotvec", 0.1, 0.1), _MANISKILL_POSE),
             gripper_state=openness(read("observation/state", 7, 8), 0, FRANKA_WIDTH / 2),
         ),
         depth=Depth("depth", 2.0**-10, "main_camera_intrinsic_cv", "main_camera_extrinsic_cv"),
         notes=(
             "the gripper's -1 (closed) to 1 (open) becomes 0 to 1; octo and openvla leave it",
             "rotations are axis-angle, not roll-pitch-yaw; a unit of action is 0.1 m or 0.1 rad",
+            "actions are in the tool's frame, the default of ManiSkill2's controller: brought to the world's",
             "quaternions have their real part first; poses are in the simulator's world frame",
             "calibrated depth: the one dataset that can feed the 3D path",
         ),

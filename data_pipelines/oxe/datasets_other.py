@@ -7,7 +7,19 @@ source; octo's and openvla's ``oxe/transforms``.
 import numpy as np
 
 from data_pipelines.oxe.dataset import OxeDataset, View
-from data_pipelines.oxe.motion import Arm, Column, constant, delta, following, join, openness, pose, read, settled
+from data_pipelines.oxe.motion import (
+    Arm,
+    Column,
+    constant,
+    delta,
+    following,
+    in_base,
+    join,
+    openness,
+    pose,
+    read,
+    settled,
+)
 
 BUCKET = "gs://gresearch/robotics"
 _NAVIGATION = ("navigation: left out of every mixture here",)
@@ -94,6 +106,8 @@ def _libero(suite: str) -> OxeDataset:
     return OxeDataset(f"libero_{suite}_no_noops", 20, source, images, (arm,), notes=notes)
 
 
+_DOBBE_POSE = pose(join(read("observation/xyz"), read("observation/quat")), "xyzw")
+
 DATASETS = [
     OxeDataset(
         "gnm_dataset",
@@ -159,13 +173,14 @@ DATASETS = [
         (
             Arm(
                 gripper=openness(read("action", 6, 7), 0, 1),
-                pose=pose(join(read("observation/xyz"), read("observation/quat")), "xyzw"),
-                action=delta(read("action", 0, 6), "rpy"),
+                pose=_DOBBE_POSE,
+                action=in_base(delta(read("action", 0, 6), "rpy"), _DOBBE_POSE, translation=False),
                 gripper_state=openness(read("observation/gripper"), 0, 1),
             ),
         ),
         notes=(
             "wrist camera only; openvla uses it as the primary view",
+            "the rotation of an action is in the tool's frame, its translation is not",
             "every frame of the 30 Hz videos is a step (SudeepDasari/dobbe_rlds_dataset_builder); Dobb-E's policies run"
             " at 3.75 Hz",
         ),

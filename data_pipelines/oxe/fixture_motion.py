@@ -109,6 +109,8 @@ class StepOf:
     drpy = property(lambda self: self._turn.as_euler("xyz"))
     drotvec = property(lambda self: self._turn.as_rotvec())
     dxyzw = property(lambda self: self._turn.as_quat())
+    tool_drpy = property(lambda self: self._tool_turn.as_euler("xyz"))
+    tool_drotvec = property(lambda self: self._tool_turn.as_rotvec())
     tool_dypr = property(lambda self: self._tool_turn.as_euler("ZYX"))
     yaw = property(lambda self: self._rotation.as_euler("xyz")[2:])
     dyaw = property(lambda self: self._turn.as_euler("xyz")[2:])

@@ -57,7 +57,7 @@ def _pr2() -> Fixture:
 def _maniskill(s: StepOf, _: StepOf) -> Values:
     camera = camera_from_world()
     return {
-        "action": [*s.dp / 0.1, *s.drotvec / 0.1, 2 * s.open - 1],
+        "action": [*s.tool_dp / 0.1, *s.tool_drotvec / 0.1, 2 * s.open - 1],
         "observation/tcp_pose": [*s.p, *s.wxyz],
         "observation/state": [*s.noise(7), 0.04 * s.was, 0.04 * s.was, *s.noise(9)],
         "observation/depth": DEPTH_COUNTS,

@@ -113,7 +113,7 @@ FIXTURES = {
         f"{STEP} discount=f language_embedding=512 language_instruction=s action=7 observation/gripper=1"
         " observation/quat=4 observation/rot=3 observation/state=7 observation/wrist_image=J256x256 observation/xyz=3",
         lambda s, _: {
-            "action": [*s.dp, *s.drpy, s.open],
+            "action": [*s.dp, *s.tool_drpy, s.open],
             "observation/gripper": [s.was],
             "observation/quat": s.xyzw,
             "observation/xyz": s.p,

@@ -150,6 +150,17 @@ def delta(column: Column, rotation: RotationKind, scale: float = 1.0, turn: floa
     return column_of
 
 
+def in_base(action: Column, pose: Column, translation: bool = True) -> Column:
+    """(T, 6): displacements in the tool's frame (or, with `translation` false, their rotation alone) in the base's."""
+
+    def column_of(episode: RldsEpisode) -> np.ndarray:
+        moved, tool = action(episode), Rotation.from_quat(pose(episode)[:, 3:])
+        shift = tool.apply(moved[:, :3]) if translation else moved[:, :3]
+        return np.concatenate([shift, tool.apply(moved[:, 3:])], axis=1)
+
+    return column_of
+
+
 def openness(column: Column, closed: float, opened: float) -> Column:
     """(T,), the reading mapped linearly so that `closed` gives 0 and `opened` gives 1, clipped to that."""
     return lambda episode: np.clip((column(episode)[:, 0] - closed) / (opened - closed), 0.0, 1.0)
