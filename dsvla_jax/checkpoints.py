@@ -16,6 +16,7 @@ import contextlib
 import dataclasses
 import logging
 import math
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -92,14 +93,13 @@ class RunCheckpoints:
         self.folder = run.absolute() / "checkpoints"
         self._base = run.absolute() / "base"
         self._read_only = read_only
-        self._newest = _first_process_decides(lambda: _newest_whole_step(self.folder, put_aside=not read_only))
+        self._newest = _first_process_decides(lambda: _tidy(self.folder, read_only))
         if read_only:
             options = ocp.CheckpointManagerOptions(read_only=True, create=False, best_fn=_rank)
         else:
             latest = preservation_policy.LatestN(keep)
             best = preservation_policy.BestN(get_metric_fn=_rank, n=1, keep_checkpoints_without_metrics=False)
             options = ocp.CheckpointManagerOptions(
-                cleanup_tmp_directories=True,
                 best_fn=_rank,
                 preservation_policy=preservation_policy.AnyPreservationPolicy([latest, best]),
                 async_options=ocp.AsyncOptions(
@@ -263,6 +263,15 @@ class RunCheckpoints:
 def _steps(folder: Path) -> list[int]:
     """The steps that are in the folder under their final names."""
     return sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())
+
+
+def _tidy(folder: Path, read_only: bool) -> int | None:
+    """The newest whole step; removes what a killed run had begun to write, unless `read_only`."""
+    if not read_only:
+        # orbax would do it in a thread that a run which fails at once does not wait for, and that then dies loudly.
+        for unfinished in ocp.utils.tmp_checkpoints(folder):
+            shutil.rmtree(unfinished.get())
+    return _newest_whole_step(folder, put_aside=not read_only)
 
 
 def _newest_whole_step(folder: Path, put_aside: bool) -> int | None:

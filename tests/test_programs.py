@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from configs import get_config
+from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
 from dsvla_jax.training.experiment import save_experiment
+from tests.rlbench_files import write_dataset
 
 ROOT = Path(__file__).parent.parent
 
@@ -55,6 +57,20 @@ def test_a_run_of_another_config_is_not_overwritten(tmp_path: Path):
     assert "started with another config (batch_size differ)" in result.stderr
     assert "Traceback" not in result.stderr
     assert (folder / "config.json").read_text() == before
+
+
+def test_words_that_a_vocabulary_lacks_end_in_one_message(tmp_path: Path):
+    """A mistake that is found once the run folder is open."""
+    source = write_dataset(tmp_path / "source", ["rinse_mug"], 1, size=8, frames=8, descriptions=["rinse the mug"])
+    import_demonstrations(source, tmp_path / "mine", Settings(), progress=False)
+    unfinished = tmp_path / "run" / "checkpoints" / "3.orbax-checkpoint-tmp"
+    unfinished.mkdir(parents=True)
+    data = ["--data.source", "episodes", "--data.folder", "mine", "--data.tasks", "all"]
+    result = run(str(ROOT / "train.py"), "tiny", "--run", "run", *data, folder=tmp_path)
+    assert result.returncode == 1
+    assert result.stderr.startswith("error: mine: the vocabulary has no token for 'mug', 'rinse'")
+    assert "Traceback" not in result.stderr
+    assert not unfinished.exists(), "what a killed run had begun to write is removed"
 
 
 @pytest.mark.slow
