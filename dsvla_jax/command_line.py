@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -19,6 +20,14 @@ def fail_with_message() -> Iterator[None]:
         yield
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except OSError as error:
+        # Without a file's name it is no file that a user named, unless the disk is full.
+        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        where = "" if error.filename is None else f"{error.filename}: "
+        fix = "choose another path, or mend this one (its name, permissions, free space)"
+        print(f"error: {where}{error.strerror}; {fix}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print("stopped; nothing that was finished is lost", file=sys.stderr)

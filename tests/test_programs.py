@@ -34,6 +34,8 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (["eval.py", "nowhere"], "no run here"),
         (["eval.py", "nowhere", "--compare", "elsewhere"], "no results here; evaluate first"),
         (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
+        (["train.py", "tiny", "--run", "/dev/null/run"], "error: /dev/null/run: Not a directory; choose another path"),
+        (["-m", "data_pipelines.oxe", "fixtures", "/dev/null", "--datasets", "viola"], "error: /dev/null/viola"),
     ],
 )
 def test_a_mistake_ends_in_one_message(arguments: list[str], expected: str, tmp_path: Path):
