@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from data_pipelines.oxe.dataset import View
 from data_pipelines.oxe.fixture_build import episode_of, features_of
 from data_pipelines.oxe.fixture_motion import known_episode
-from data_pipelines.oxe.fixtures import FIXTURES, write_fixture
+from data_pipelines.oxe.fixtures import FIXTURES, write_fixture, write_fixtures
 from data_pipelines.oxe.registry import DATASETS, MIXTURES, get_dataset, get_mixture
 from data_pipelines.records import DataError
+from data_pipelines.rlds import writing
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.writing import write_build
 from dsvla_jax.errors import UserError
@@ -121,6 +122,24 @@ def test_sources_are_versions_that_are_published():
         if not bucket:
             folder, version = place.split("/")
             assert version == VERSIONS.get(folder, "0.1.0"), dataset.name
+
+
+def test_fixtures_whose_writing_was_interrupted_are_written_again(tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(writing, "_write_shard", stop)
+        with pytest.raises(KeyboardInterrupt):
+            write_fixtures(tmp_path, ["viola"])
+    with pytest.raises(DataError, match=r"viola: build: expected features\.json here"):
+        RldsBuild(tmp_path / "viola")
+    write_fixtures(tmp_path, ["viola"])
+    (build,) = (tmp_path / "viola").iterdir()
+    written = build.stat().st_mtime_ns
+    write_fixtures(tmp_path, ["viola"])
+    assert len(list(episodes_of(build))) == 4
+    assert build.stat().st_mtime_ns == written
 
 
 def test_every_dataset_tells_a_hand_or_says_why_not():

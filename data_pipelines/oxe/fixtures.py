@@ -6,8 +6,10 @@ Features have the names, shapes and dtypes of the published builds. What the reg
 and to try the whole path from pretraining to finetuning without a download.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
+
+from tqdm import tqdm
 
 from data_pipelines.oxe import fixtures_converted, fixtures_other, fixtures_rtx
 from data_pipelines.oxe.fixture_build import Fixture, episode_of, features_of
@@ -39,8 +41,9 @@ def write_fixture(
     return known
 
 
-def write_fixtures(folder: Path, names: Iterable[str], episodes: int = 4, steps: int = 6) -> None:
-    """One build a name; those that are there already are kept."""
-    for name in names:
-        if not (folder / name).exists():
+def write_fixtures(folder: Path, names: Sequence[str], episodes: int = 4, steps: int = 6) -> None:
+    """One build a name; those that are there already are kept, whatever their version."""
+    for name in tqdm(names, desc="fixtures", unit="build"):
+        # What an interrupted writer left ends in .partial.
+        if not any((folder / name).glob("*[0-9]/features.json")):
             write_fixture(folder, name, episodes, steps)

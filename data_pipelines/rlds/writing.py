@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -34,19 +35,22 @@ def write_build(
     file_format: Format = "tfrecord",
     version: str = "0.1.0",
 ) -> Path:
-    """Writes ``folder/name/version`` and returns it.
+    """Writes ``folder/name/version``, whole or not at all, and returns it.
 
     splits: episodes by split, each as `features` tells: ``{"steps": [{...}, ...], ...}``, images as `encode_image`.
     shards: files a split; episodes are dealt out in runs.
     """
     build = folder / name / version
-    build.mkdir(parents=True)
+    partial = build.with_name(f"{version}.partial")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
     described, stored = [], _stored(features)
     for split, episodes in splits.items():
         records = [stored.serialize_example(episode) for episode in episodes]
         runs = [list(map(int, run)) for run in np.array_split(np.arange(len(records)), shards)]
         for number, run in enumerate(runs):
-            path = build / f"{name}-{split}.{file_format}-{number:05d}-of-{shards:05d}"
+            path = partial / f"{name}-{split}.{file_format}-{number:05d}-of-{shards:05d}"
             _write_shard(path, [records[i] for i in run], file_format)
         described.append(
             {
@@ -57,8 +61,9 @@ def write_build(
             }
         )
     info = {"name": name, "version": version, "fileFormat": file_format, "moduleName": "", "splits": described}
-    (build / "dataset_info.json").write_text(json.dumps(info, indent=1) + "\n")
-    (build / "features.json").write_text(json.dumps(features.to_json(), indent=1) + "\n")
+    (partial / "dataset_info.json").write_text(json.dumps(info, indent=1) + "\n")
+    (partial / "features.json").write_text(json.dumps(features.to_json(), indent=1) + "\n")
+    partial.rename(build)
     return build
 
 
