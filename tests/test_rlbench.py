@@ -263,6 +263,32 @@ def test_what_is_left_out_is_counted_and_listed(tmp_path, capsys):
         assert f"episode{number}/front_rgb/5.png: file: expected a picture of each of 12" in printed
 
 
+def test_what_was_left_out_is_tried_again(tmp_path):
+    source = files.write_dataset(tmp_path / "source", ["lamp_on"], episodes=3, frames=12, size=16)
+    pickled = source / "lamp_on/all_variations/episodes/episode1/low_dim_obs.pkl"
+    whole = pickled.read_bytes()
+    pickled.unlink()
+    assert len(import_demonstrations(source, tmp_path / "out", Settings(), skip_bad=True, progress=False)) == 1
+    with pytest.raises(DataError, match=r"episode1/low_dim_obs\.pkl"):
+        import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
+    assert len(EpisodeReader(tmp_path / "out")) == 2
+    pickled.write_bytes(whole)
+    assert import_demonstrations(source, tmp_path / "out", Settings(), progress=False) == []
+    assert len(EpisodeReader(tmp_path / "out")) == 3
+
+
+def test_what_was_imported_is_not_lost(source, tmp_path):
+    """Neither to a wish for fewer episodes nor to another split, whose episodes have the same names."""
+    import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
+    import_demonstrations(source, tmp_path / "out", Settings(), episodes=1, progress=False)
+    assert len(EpisodeReader(tmp_path / "out")) == 4
+    test = files.write_dataset(tmp_path / "test", ["lamp_on"], episodes=1, frames=12, size=48)
+    for other in (test, test / "lamp_on"):
+        with pytest.raises(DataError, match=r"out: lamp_on/all_variations/episodes/episode0: .*import each split"):
+            import_demonstrations(other, tmp_path / "out", Settings(), progress=False)
+    assert len(EpisodeReader(tmp_path / "out", verify="sha256")) == 4
+
+
 def test_import_goes_on_where_it_stopped(source, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     import_demonstrations(source, whole, Settings(), progress=False)

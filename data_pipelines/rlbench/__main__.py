@@ -5,6 +5,7 @@ SRC is a folder of tasks as RLBench's generators write it. OUT receives episodes
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from data_pipelines.recording import make_demonstration
 from data_pipelines.records import DataError, Episode
 from data_pipelines.rlbench.files import find_episodes, read_recording
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.digests import file_digest
 
 EPISODES_PER_SHARD = 20
 
@@ -73,6 +75,28 @@ def import_episode(folder: Path, task: str, number: int, settings: Settings) -> 
     return make_demonstration(recording, sample_starts(keyframes, settings.every_n), number, folder)
 
 
+def origin_name(task: str, folder: Path) -> str:
+    """An episode's name, wherever its task's folder is."""
+    return "/".join([task, *folder.parts[-3:]])
+
+
+def origin_of(task: str, folders: Sequence[Path]) -> dict[str, str | None]:
+    """By name, what tells episodes from others of that name, such as another split's: a digest of what was felt.
+
+    None stands for what was left out.
+    """
+    paths = {origin_name(task, folder): folder / "low_dim_obs.pkl" for folder in folders}
+    return {name: file_digest(path) if path.is_file() else None for name, path in paths.items()}
+
+
+def require_same_origin(out: Path, origin: dict[str, str | None], before: dict[str, str | None]) -> None:
+    """Raises DataError if an episode that is in `out` is another one than that of the same name now."""
+    for name, digest in origin.items():
+        if digest is not None and before.get(name, digest) not in (digest, None):
+            fix = "import each split into a folder of its own; if the data set was mended, delete this one first"
+            raise DataError(out, name, "the episode that was imported before", "another of that name", fix)
+
+
 def import_demonstrations(
     source: Path,
     out: Path,
@@ -85,7 +109,7 @@ def import_demonstrations(
     """Writes the folder `out`; returns what was left out, as {"episode", "reason"} each.
 
     Raises DataError for a damaged episode unless `skip_bad`; what was written before stays, and is gone on
-    with by calling again.
+    with by calling again, which also tries again what was left out.
     """
     found = find_episodes(source)
     if missing := set(tasks) - set(found):
@@ -93,17 +117,23 @@ def import_demonstrations(
     chosen = {task: folders[:episodes] for task, folders in found.items() if not tasks or task in tasks}
     wanted = {"importer": "rlbench", **dataclasses.asdict(settings)}
     entries = {entry["file"]: entry for entry in existing_shards(out, wanted)}
+    imported = {name: digest for entry in entries.values() for name, digest in entry.get("origin", {}).items()}
     with tqdm(total=sum(map(len, chosen.values())), desc="import", unit="episode", disable=not progress) as bar:
         for task, folders in chosen.items():
             bar.set_postfix_str(task)
             for start in range(0, len(folders), EPISODES_PER_SHARD):
                 group = folders[start : start + EPISODES_PER_SHARD]
                 name = shard_name(task, start // EPISODES_PER_SHARD)
-                sources = [str(folder.relative_to(source)) for folder in group]
-                if name in entries and entries[name]["sources"] == sources and (out / name).exists():
-                    check_shard(out, entries[name], digest=True)
-                    bar.update(len(group))
-                    continue
+                origin = origin_of(task, group)
+                require_same_origin(out, origin, imported)
+                if name in entries and (out / name).exists():
+                    before = entries[name].get("origin", {})
+                    whole = before == origin and None not in before.values()
+                    # A wish for fewer episodes than before is none to lose the others.
+                    if whole or (episodes is not None and origin.keys() < before.keys()):
+                        check_shard(out, entries[name], digest=True)
+                        bar.update(len(group))
+                        continue
                 good, skipped = [], []
                 for number, folder in enumerate(group, start):
                     try:
@@ -112,8 +142,9 @@ def import_demonstrations(
                         if not skip_bad:
                             raise
                         skipped.append({"episode": str(folder), "reason": str(error)})
+                        origin[origin_name(task, folder)] = None
                     bar.update()
-                entries[name] = write_shard(out, name, task, good, sources=sources, skipped=skipped)
+                entries[name] = write_shard(out, name, task, good, origin=origin, skipped=skipped)
                 write_index(out, [entries[key] for key in sorted(entries)], wanted)
     return [item for entry in entries.values() for item in entry["skipped"]]
 
