@@ -506,6 +506,8 @@ def test_unknown_words_need_a_vocabulary(folder, tmp_path, capsys):
 def test_datasets_that_cannot_give_the_targets(folder):
     with pytest.raises(UserError, match=r"roboturk: it tells no poses of the hand.*Set target to relative"):
         make(folder, ("roboturk", "cmu_stretch"), target="absolute")
+    with pytest.raises(UserError, match=r"relative targets: aloha_\w+: it tells joints, not the hand\. Choose others"):
+        make(folder, ("aloha_static_dataset", "cmu_stretch"))
     loader = make(folder, ("roboturk", "cmu_stretch"), target="absolute", unsupported="leave_out")
     assert [item.dataset.name for item in loader.source.datasets] == ["cmu_stretch"]
     with pytest.raises(UserError, match="toto: no such dataset; copy it there from gs://gresearch/robotics/toto"):

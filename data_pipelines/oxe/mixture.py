@@ -193,9 +193,10 @@ def open_mixture(config: OxeConfig, progress: bool = True) -> tuple[list[OpenDat
     refused = {name: reason for name, reason in reasons.items() if reason}
     if refused and config.unsupported == "refuse":
         told = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+        fix = "Set target to relative, choose" if config.target == "absolute" else "Choose"
         raise UserError(
-            f"mixture: some datasets cannot give {config.target} targets: {told}. Set target to relative,"
-            " choose others, or set unsupported to leave_out"
+            f"mixture: some datasets cannot give {config.target} targets: {told}. {fix} others, or set unsupported to"
+            " leave_out"
         )
     kept = [name for name in weights if name not in refused]
     if not kept:
