@@ -54,9 +54,9 @@ def test_a_run_of_another_config_is_not_overwritten(tmp_path: Path):
     folder.mkdir(parents=True)
     save_experiment(folder / "config.json", replace(get_config("tiny"), batch_size=7, log_every=3))
     before = (folder / "config.json").read_text()
-    result = run(str(ROOT / "train.py"), "tiny", folder=tmp_path)
+    result = run(str(ROOT / "train.py"), "tiny", "--data.crop", "0.8", folder=tmp_path)
     assert result.returncode == 1
-    assert "started with another config (batch_size differ)" in result.stderr
+    assert "started with another config (data.crop, batch_size differ)" in result.stderr
     assert "Traceback" not in result.stderr
     assert (folder / "config.json").read_text() == before
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cattrs
 
@@ -119,8 +119,18 @@ FREE_TO_CHANGE = (
 
 
 def outcome_differences(one: Experiment, other: Experiment) -> list[str]:
-    """The fields that differ, of those that decide what a run learns."""
-    return [name for name in vars(one) if name not in FREE_TO_CHANGE and getattr(one, name) != getattr(other, name)]
+    """The fields that differ, of those that decide what a run learns; as on the command line, such as data.crop."""
+    return [name for name in _differences(one, other) if name.split(".")[0] not in FREE_TO_CHANGE]
+
+
+def _differences(one: Any, other: Any) -> list[str]:
+    if type(one) is not type(other) or not dataclasses.is_dataclass(one):
+        return []
+    names = []
+    for name, value in vars(one).items():
+        if value != (against := getattr(other, name)):
+            names += [f"{name}.{field}" for field in _differences(value, against)] or [name]
+    return names
 
 
 _converter = cattrs.Converter(forbid_extra_keys=True)
