@@ -3,6 +3,8 @@
 import dataclasses
 from typing import Literal
 
+from dsvla_jax.errors import UserError
+
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig:
@@ -35,6 +37,9 @@ class DataConfig:
     colour_variation: float = 0.0
     """Relative strength of the brightness, contrast and colour variation; 0 turns it off."""
 
+    def __post_init__(self) -> None:
+        _require(0 < self.crop <= 1, "crop", "more than 0, at most 1", self.crop)
+
 
 @dataclasses.dataclass(frozen=True)
 class OxeConfig:
@@ -65,3 +70,15 @@ class OxeConfig:
     """Leave damaged records and pictures out, and list them, instead of stopping."""
     cache: str = ""
     """A folder for indices and statistics; empty: beside the data, or the user's cache where that cannot be written."""
+
+    def __post_init__(self) -> None:
+        _require(self.horizon >= 0, "horizon", "seconds ahead, or 0 for the next key frame", self.horizon)
+        _require(0 < self.crop <= 1, "crop", "more than 0, at most 1", self.crop)
+        _require(self.image_size > 0, "image_size", "at least 1", self.image_size)
+        _require(self.window > 0, "window", "at least 1", self.window)
+        _require(self.streams > 0, "streams", "at least 1", self.streams)
+
+
+def _require(holds: bool, field: str, expected: str, got: float) -> None:
+    if not holds:
+        raise UserError(f"{field}: expected {expected}, got {got}")

@@ -31,6 +31,8 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (["train.py", "tiny", "--optimizer.learning-rat", "1"], "learning-rate"),
         (["train.py", "tiny", "--steps", "many"], "many"),
         (["train.py", "tiny", "--data.tasks", "lamp_of"], "lamp_on"),
+        (["train.py", "tiny", "--data.crop", "1.5"], "crop: expected more than 0, at most 1, got 1.5"),
+        (["train.py", "tiny_oxe", "--oxe.horizon", "-1"], "horizon: expected seconds ahead, or 0 for the"),
         (["eval.py", "nowhere"], "no run here"),
         (["eval.py", "nowhere", "--compare", "elsewhere"], "no results here; evaluate first"),
         (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
