@@ -39,7 +39,7 @@ from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
 from dsvla_jax.rollout import Stopped, run_task
 from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.sim.tasks import TASKS, select_tasks
 from dsvla_jax.training import loop
 from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes
 from dsvla_jax.training.experiment import Experiment, load_experiment, outcome_differences, save_experiment
@@ -78,7 +78,10 @@ def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "",
     if stopped is not None:
         print(f"{stopped.name}: {run} is saved at step {step_reached}; the same command goes on from there")
         return EXIT_STATUS[stopped]
-    print(f"trained: {run} (evaluate it with: python eval.py {run})")
+    # The simulator does not have the tasks of one's own demonstrations.
+    simulated = set(experiment.data.tasks) <= TASKS.keys()
+    use = "evaluate it with: python eval.py" if simulated else "serve it with: python -m dsvla_jax.serving"
+    print(f"trained: {run} ({use} {run})")
     return 0
 
 
