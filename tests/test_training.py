@@ -13,10 +13,11 @@ from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.number_targets import NumberTargets, number_rows
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.experiment import Experiment, load_experiment, save_experiment
+from dsvla_jax.training.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests.small import small_encoding, small_language, small_vision
@@ -97,6 +98,18 @@ def test_lora_regime_changes_adapters_and_projection_and_nothing_else(fusion):
 def test_full_regime_fits_a_batch():
     _, _, _, losses = train(dataclasses.replace(small_experiment(), steps=60), 60)
     assert losses[-1] < 0.5 * losses[0]
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_few_steps_have_a_schedule(steps):
+    optimizer = make_optimizer(OptimizerConfig(), steps)
+    variables = {"w": jnp.ones((2, 2))}
+    state = optimizer.init(variables)
+    for _ in range(steps):
+        updates, state = optimizer.update({"w": jnp.ones((2, 2))}, state, variables)
+    assert np.all(np.asarray(updates["w"]) < 0)
+    with pytest.raises(UserError, match="steps: expected at least 1, got 0"):
+        dataclasses.replace(small_experiment(), steps=0)
 
 
 def test_only_answer_tokens_are_learned():

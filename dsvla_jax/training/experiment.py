@@ -93,6 +93,8 @@ class Experiment:
         return self.data.keypoints if self.encoding.use_keypoints else "oracle"
 
     def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise UserError(f"steps: expected at least 1, got {self.steps}")
         if self.regime != "full" and self.model.lora is None:
             raise UserError(
                 f"regime: {self.regime!r} needs adapters, but model.lora is None; give the config a LoraConfig"

@@ -65,7 +65,7 @@ def start_state(trainable: Variables, optimizer: optax.GradientTransformation, s
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
     """AdamW; weight decay only on matrices, as norms, biases and embeddings of single rows are no places for it."""
-    warmup = min(config.warmup_steps, max(steps // 5, 1))
+    warmup = min(config.warmup_steps, max(steps // 5, 1), steps - 1)
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, config.learning_rate, warmup, steps, end_value=config.learning_rate * config.final_fraction
     )
