@@ -101,4 +101,4 @@ if __name__ == "__main__":
         if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
             print(__doc__)
             sys.exit(0 if len(sys.argv) > 1 else 2)
-        tyro.extras.subcommand_cli_from_dict(commands)
+        tyro.extras.subcommand_cli_from_dict(commands, prog="python -m data_pipelines.oxe")
