@@ -84,6 +84,7 @@ def train(
             bar.update()
             if not clock.started():
                 jax.block_until_ready(values)
+                bar.set_postfix_str("")
                 clock.start()
             else:
                 clock.count(experiment.batch_size, int(batch["text_mask"].sum()) * jax.process_count())
