@@ -66,6 +66,8 @@ class OxeConfig:
     """Parts that episodes are dealt to. As many processes, or a divisor of it, read none of each other's records."""
     unsupported: Literal["refuse", "leave_out"] = "refuse"
     """What to do with datasets that do not tell what the target needs."""
+    colours_mended: bool = False
+    """The copies have red and blue in their places, as those that went through rlds_dataset_mod for octo or openvla."""
     skip_bad: bool = False
     """Leave damaged records and pictures out, and list them, instead of stopping."""
     cache: str = ""

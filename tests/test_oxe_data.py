@@ -198,6 +198,8 @@ def test_a_position_of_other_data_is_refused(folder):
     with pytest.raises(DataError, match=r"saved position: data: expected .*; put the same data back"):
         make(folder, FIVE[:4]).set_state(state)
     assert set(state["scale"]) == {"low", "high"}
+    with pytest.raises(DataError, match=r"saved position: scale: expected .*; put the same data back"):
+        make(folder, horizon=0.3).set_state(state)
 
 
 def scale_of(loader):
@@ -260,7 +262,7 @@ def test_of_many_frames_evenly_spaced_ones_of_both_arms_make_the_statistics(fold
             frames.append(np.reshape(moved, (2, 6)))
     assert len(frames) == index.num_samples == 81
     expected = np.quantile(np.concatenate(frames[::4]), np.linspace(0, 1, 101), axis=0)
-    np.testing.assert_allclose(index.quantiles, expected, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(index.quantiles), expected, atol=1e-5)
 
 
 def test_absolute_answers_are_poses_and_prompts_have_no_keypoint(folder):
@@ -284,6 +286,19 @@ def test_absolute_answers_are_poses_and_prompts_have_no_keypoint(folder):
         assert "near" not in text
         state = np.rint(np.append(arm.position[step] * 100, 0)[:3]).astype(int)
         assert " ".join(map(str, state)) in text
+
+
+@pytest.mark.parametrize("mended", [False, True])
+def test_red_and_blue_are_put_right_where_the_copies_are_as_published(tmp_path, mended):
+    name = "utaustin_mutex"
+    write_fixture(tmp_path, name, episodes=9, steps=9)
+    loader = make(tmp_path, (name,), streams=1, threads=0, crop=1.0, colour_variation=0.0, colours_mended=mended)
+    places = [loader.source[i] for i in range(4)]
+    for rgb, place in zip(next(loader)["rgb"], places, strict=True):
+        known, step = truth_of(name, place.where)
+        red, green, blue = known.colour(step)
+        expected = (blue, green, red) if mended else (red, green, blue)
+        assert np.abs(rgb.astype(int) - expected).max() <= 3
 
 
 def test_key_frames_are_gripper_changes_rests_and_the_end():

@@ -103,11 +103,11 @@ def test_full_regime_fits_a_batch():
 @pytest.mark.parametrize("steps", [1, 2])
 def test_few_steps_have_a_schedule(steps):
     optimizer = make_optimizer(OptimizerConfig(), steps)
-    variables = {"w": jnp.ones((2, 2))}
-    state = optimizer.init(variables)
+    weight = jnp.ones((2, 2))
+    state = optimizer.init(weight)
     for _ in range(steps):
-        updates, state = optimizer.update({"w": jnp.ones((2, 2))}, state, variables)
-    assert np.all(np.asarray(updates["w"]) < 0)
+        update, state = optimizer.update(jnp.ones((2, 2)), state, weight)
+    assert np.all(np.asarray(update) < 0)
     with pytest.raises(UserError, match="steps: expected at least 1, got 0"):
         dataclasses.replace(small_experiment(), steps=0)
 

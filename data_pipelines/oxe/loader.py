@@ -1,6 +1,7 @@
 """Batches of a mixture, with the interface of ``data_pipelines.loader``: an iterator with a position to save."""
 
 import dataclasses
+import json
 import operator
 import os
 import sys
@@ -81,10 +82,12 @@ class OxeLoader(Iterator[Sample]):
         return {"position": self._batches.get_state(), "data": repr(self.source), "scale": scale}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Goes on from a position. Raises DataError where the data or the mixture are others than then."""
-        if state.get("data") != repr(self.source):
-            fix = "put the same data back, or start a new run"
-            raise DataError("saved position", "data", str(state.get("data")), repr(self.source), fix)
+        """Goes on from a position. Raises DataError where the data, the mixture or the scale are others than then."""
+        then, now = (json.loads(json.dumps(one)) for one in (state, self.get_state()))
+        for part in ("data", "scale"):
+            if then.get(part) != now[part]:
+                fix = "put the same data back, or start a new run"
+                raise DataError("saved position", part, str(then.get(part)), str(now[part]), fix)
         self._batches.set_state(state["position"])
 
 

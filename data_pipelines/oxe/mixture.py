@@ -79,7 +79,8 @@ class OpenDataset:
         path = f"steps/observation/{self.dataset.images[self.view]}"
         pictures, steps = list(episode.encoded(path)), self.dataset.steps(episode)
         cameras = self._cameras(episode)
-        kind = image_format(self.build.features[path], self.view in self.dataset.bgr)
+        bgr = self.view in self.dataset.bgr and not self.config.colours_mended
+        kind = image_format(self.build.features[path], bgr)
         return [
             EncodedSample(
                 dataset=self.dataset.name,
