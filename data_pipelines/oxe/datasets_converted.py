@@ -1,9 +1,8 @@
 """Datasets of Open X-Embodiment that others converted to RLDS: one action vector, one state vector.
 
 Facts: the column descriptions of each dataset's page of https://www.tensorflow.org/datasets/catalog; octo's and
-openvla's ``oxe/transforms`` for what the pages leave open. Where a page's words leave open whether an action is a pose
-or a displacement, the action is left out and displacements come from reached poses. Pictures with red and blue
-exchanged: ``prepare_open_x.sh`` of https://github.com/kpertsch/rlds_dataset_mod.
+openvla's ``oxe/transforms`` for what the pages leave open. Pictures with red and blue exchanged:
+``prepare_open_x.sh`` of https://github.com/kpertsch/rlds_dataset_mod.
 """
 
 import numpy as np
@@ -13,7 +12,6 @@ from data_pipelines.oxe.motion import (
     FRANKA_WIDTH,
     Arm,
     Column,
-    RotationKind,
     constant,
     delta,
     following,
@@ -27,16 +25,13 @@ from data_pipelines.oxe.motion import (
 from data_pipelines.rlds.features import RldsEpisode
 
 BUCKET = "gs://gresearch/robotics"
-_SUFFIX = "_converted_externally_to_rlds"
+SUFFIX = "_converted_externally_to_rlds"
 _SCALED = "actions are scaled to -1..1: only reached poses are metric"
-_UNCLEAR = "whether the action is a pose or a displacement is unclear: displacements come from reached poses"
 _WRIST: dict[View, str] = {"primary": "image", "wrist": "wrist_image"}
 _IMAGE: dict[View, str] = {"primary": "image"}
 _BGR: tuple[View, ...] = ("primary", "wrist")
-_WATCHED = (
-    "1 is closed, as thu-ml/RoboticsDiffusionTransformer found by watching episodes: octo and openvla keep it the wrong"
-    " way round"
-)
+OPENING_DOUBTED = "unsure: thu-ml/RoboticsDiffusionTransformer takes 1 for closed, octo and openvla for open, as here"
+_QUATERNION_DOUBTED = "unsure: the order of the quaternion is not published"
 _EXCHANGED = "red and blue are exchanged in all pictures"
 
 
@@ -75,33 +70,6 @@ def _state_matrix(name: str, hz: float, *further: str, **options) -> OxeDataset:
     return _dataset(name, hz, _WRIST, arm, notes=(*notes, *further), **options)
 
 
-def _reached(
-    name: str,
-    hz: float,
-    rotation: RotationKind,
-    gripper_state: Column | None = None,
-    images: dict[View, str] | None = None,
-    gripper: Column | None = None,
-    state: str = "observation/state",
-    scale: float = 1.0,
-    notes: tuple[str, ...] = (),
-    **options,
-) -> OxeDataset:
-    """Poses in the first six columns of the state, of `scale` metres; the command's pose columns are left out."""
-    gripper = _opening(6) if gripper is None else gripper
-    arm = Arm(gripper=gripper, pose=pose(read(state, 0, 6), rotation, scale), gripper_state=gripper_state)
-    return _dataset(name, hz, images or _IMAGE, arm, notes=(_UNCLEAR, *notes), **options)
-
-
-def _pr2(name: str) -> OxeDataset:
-    measured = openness(read("observation/state", 6, 7), 0, 86)
-    notes = (
-        "positions and the gripper's width are millimetres, as thu-ml/RoboticsDiffusionTransformer reads them",
-        "which way the gripper's action goes is not told: the opening of the next step is the command",
-    )
-    return _reached(name, 10, "rpy", gripper=following(measured), gripper_state=measured, scale=1e-3, notes=notes)
-
-
 def _finger_distance(episode: RldsEpisode) -> np.ndarray:
     """Its largest value is that of thu-ml/RoboticsDiffusionTransformer."""
     return openness(read("observation/state", 6, 7), 0, 6.03)(episode)
@@ -115,7 +83,7 @@ _MANISKILL_POSE = pose(read("observation/tcp_pose"), "wxyz")
 
 DATASETS = [
     _dataset(
-        f"stanford_kuka_multimodal_dataset{_SUFFIX}",
+        f"stanford_kuka_multimodal_dataset{SUFFIX}",
         20,
         _IMAGE,
         Arm(
@@ -123,10 +91,10 @@ DATASETS = [
             pose=pose(join(read("observation/ee_position"), read("observation/ee_orientation")), "xyzw"),
             action=delta(read("action", 0, 3), "none"),
         ),
-        notes=("the peg is held throughout", "depth comes without a camera"),
+        notes=("the peg is held throughout", "depth comes without a camera", _QUATERNION_DOUBTED),
     ),
     _dataset(
-        f"nyu_rot_dataset{_SUFFIX}",
+        f"nyu_rot_dataset{SUFFIX}",
         3,
         _IMAGE,
         Arm(
@@ -138,7 +106,7 @@ DATASETS = [
         notes=("0 is open and 1 closed, in state and action: octo and openvla keep it the wrong way round",),
     ),
     _dataset(
-        f"stanford_hydra_dataset{_SUFFIX}",
+        f"stanford_hydra_dataset{SUFFIX}",
         10,
         _WRIST,
         Arm(
@@ -149,10 +117,10 @@ DATASETS = [
         bgr=_BGR,
         notes=("which of three gripper columns is the opening is not told: the last command stands for it", _EXCHANGED),
     ),
-    _state_matrix(f"austin_buds_dataset{_SUFFIX}", 20),
+    _state_matrix(f"austin_buds_dataset{SUFFIX}", 20),
     _state_matrix("utaustin_mutex", 20, _EXCHANGED, bgr=_BGR),
     _dataset(
-        f"nyu_franka_play_dataset{_SUFFIX}",
+        f"nyu_franka_play_dataset{SUFFIX}",
         3,
         {"primary": "image", "secondary": "image_additional_view"},
         Arm(
@@ -163,7 +131,7 @@ DATASETS = [
         notes=("the action starts with 7 joint velocities and ends with a flag", "depth comes without a camera"),
     ),
     _dataset(
-        f"maniskill_dataset{_SUFFIX}",
+        f"maniskill_dataset{SUFFIX}",
         20,
         _WRIST,
         Arm(
@@ -182,7 +150,7 @@ DATASETS = [
         ),
     ),
     _dataset(
-        f"furniture_bench_dataset{_SUFFIX}",
+        f"furniture_bench_dataset{SUFFIX}",
         10,
         _WRIST,
         Arm(
@@ -194,7 +162,7 @@ DATASETS = [
         notes=("the action's rotation is a quaternion",),
     ),
     _dataset(
-        f"cmu_franka_exploration_dataset{_SUFFIX}",
+        f"cmu_franka_exploration_dataset{SUFFIX}",
         10,
         {"primary": "highres_image"},
         Arm(gripper=_opening(6), action=delta(read("action", 0, 3), "none")),
@@ -207,17 +175,18 @@ DATASETS = [
         ),
     ),
     _dataset(
-        f"ucsd_kitchen_dataset{_SUFFIX}",
+        f"ucsd_kitchen_dataset{SUFFIX}",
         2,
         _IMAGE,
         Arm(gripper=_opening(6), pose=pose(read("action", 0, 6), "rpy", 1e-3, np.pi / 180)),
         notes=(
             "the action is a pose in millimetres and degrees (openvla's published statistics: mean x 410): it stands"
             " for the pose, since the state is joints only",
+            OPENING_DOUBTED,
         ),
     ),
     _dataset(
-        f"ucsd_pick_and_place_dataset{_SUFFIX}",
+        f"ucsd_pick_and_place_dataset{SUFFIX}",
         3,
         _IMAGE,
         Arm(
@@ -233,7 +202,7 @@ DATASETS = [
         ),
     ),
     _dataset(
-        f"austin_sailor_dataset{_SUFFIX}",
+        f"austin_sailor_dataset{SUFFIX}",
         20,
         _WRIST,
         Arm(
@@ -245,7 +214,7 @@ DATASETS = [
         notes=(_SCALED,),
     ),
     _dataset(
-        f"austin_sirius_dataset{_SUFFIX}",
+        f"austin_sirius_dataset{SUFFIX}",
         20,
         _WRIST,
         Arm(
@@ -255,33 +224,6 @@ DATASETS = [
             gripper_state=openness(read("observation/state_gripper"), 0, 0.077),
         ),
         notes=("`state` is joints, which octo and openvla take for a pose: state_ee is the pose", _SCALED),
-    ),
-    _pr2(f"utokyo_pr2_opening_fridge{_SUFFIX}"),
-    _pr2(f"utokyo_pr2_tabletop_manipulation{_SUFFIX}"),
-    _reached(
-        f"utokyo_xarm_pick_and_place{_SUFFIX}",
-        10,
-        "ypr",
-        images={"primary": "image", "secondary": "image2", "wrist": "hand_image"},
-        gripper=openness(read("action", 6, 7), 1, 0),
-        state="observation/end_effector_pose",
-        notes=(
-            "angles come as yaw, pitch, roll",
-            "the gripper's action is the trigger of the controller (frt03/rlds_dataset_builder), which closes: octo and"
-            " openvla keep it the wrong way round",
-        ),
-    ),
-    _dataset(
-        f"utokyo_xarm_bimanual{_SUFFIX}",
-        10,
-        _IMAGE,
-        Arm(gripper=_opening(6), pose=pose(read("observation/pose_l"), "ypr")),
-        Arm(gripper=_opening(13), pose=pose(read("observation/pose_r"), "ypr")),
-        notes=(
-            _UNCLEAR,
-            "two arms, left first: octo and openvla throw the left one away",
-            "angles come as yaw, pitch, roll",
-        ),
     ),
     _dataset(
         "robo_net",
@@ -303,7 +245,7 @@ DATASETS = [
         ),
     ),
     _dataset(
-        f"berkeley_mvp{_SUFFIX}",
+        f"berkeley_mvp{SUFFIX}",
         5,
         {"wrist": "hand_image"},
         Arm(
@@ -314,7 +256,7 @@ DATASETS = [
         notes=("actions are joints: displacements come from reached poses", "wrist camera only"),
     ),
     _dataset(
-        f"berkeley_rpt{_SUFFIX}",
+        f"berkeley_rpt{SUFFIX}",
         30,
         {"wrist": "hand_image"},
         Arm(
@@ -331,7 +273,7 @@ DATASETS = [
         ),
     ),
     _dataset(
-        f"kaist_nonprehensile{_SUFFIX}",
+        f"kaist_nonprehensile{SUFFIX}",
         10,
         _IMAGE,
         Arm(
@@ -342,7 +284,7 @@ DATASETS = [
         notes=("rotations are axis-angle; 14 columns of gains follow", "it pushes with a closed gripper"),
     ),
     _dataset(
-        f"stanford_mask_vit{_SUFFIX}",
+        f"stanford_mask_vit{SUFFIX}",
         1,
         _IMAGE,
         Arm(
@@ -356,45 +298,8 @@ DATASETS = [
             "-1 opens and 1 closes: octo and openvla keep it the wrong way round",
         ),
     ),
-    _reached(f"tokyo_u_lsmo{_SUFFIX}", 10, "rpy"),
-    _reached(
-        f"dlr_sara_pour{_SUFFIX}",
-        10,
-        "zxy",
-        gripper=openness(read("action", 6, 7), 1, 0),
-        notes=(
-            "angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",
-            _WATCHED,
-        ),
-    ),
-    _reached(
-        f"dlr_sara_grid_clamp{_SUFFIX}",
-        10,
-        "zxy",
-        gripper=openness(read("action", 6, 7), 1, 0),
-        notes=(
-            "angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",
-            _WATCHED,
-        ),
-    ),
-    _reached(
-        f"dlr_edan_shared_control{_SUFFIX}",
-        5,
-        "zxy",
-        gripper=openness(read("action", 6, 7), 1, 0),
-        gripper_state=openness(read("observation/state", 6, 7), 1, 0),
-        notes=("angles are about fixed z, x, y: octo and openvla take them for roll, pitch, yaw",),
-    ),
-    _reached(
-        f"asu_table_top{_SUFFIX}",
-        12.5,
-        "rpy",
-        gripper_state=openness(read("observation/state", 6, 7), 0, 1),
-        state="ground_truth_states/EE",
-        notes=("the page calls the action joint velocities",),
-    ),
     _dataset(
-        f"stanford_robocook{_SUFFIX}",
+        f"stanford_robocook{SUFFIX}",
         5,
         {"primary": "image_1", "secondary": "image_2"},
         Arm(
@@ -422,10 +327,11 @@ DATASETS = [
         notes=(
             "displacements are in the frame of the tool, angles as yaw, pitch, roll",
             "both cameras are the wrist's",
+            OPENING_DOUBTED,
         ),
     ),
     _dataset(
-        f"iamlab_cmu_pickup_insert{_SUFFIX}",
+        f"iamlab_cmu_pickup_insert{SUFFIX}",
         20,
         _WRIST,
         Arm(
@@ -465,6 +371,7 @@ DATASETS = [
         notes=(
             "no gripper action: the next state stands for it, 1 being closed as octo and openvla have it",
             "end_effector_state is the pose, which octo and openvla leave unread",
+            _QUATERNION_DOUBTED,
             _EXCHANGED,
         ),
     ),
@@ -493,6 +400,7 @@ DATASETS = [
         metric=False,
         notes=(
             "the rotation is a quaternion; octo and openvla take its tail, the gripper and a flag for rotation",
+            _QUATERNION_DOUBTED,
             "the gripper's state is its width, up to 85 mm as thu-ml/RoboticsDiffusionTransformer has it",
         ),
     ),

@@ -2,13 +2,13 @@
 
 import difflib
 
-from data_pipelines.oxe import datasets_converted, datasets_other, datasets_rtx
+from data_pipelines.oxe import datasets_converted, datasets_other, datasets_reached, datasets_rtx
 from data_pipelines.oxe.dataset import OxeDataset
 from dsvla_jax.errors import UserError
 
 DATASETS: dict[str, OxeDataset] = {
     dataset.name: dataset
-    for module in (datasets_rtx, datasets_converted, datasets_other)
+    for module in (datasets_rtx, datasets_converted, datasets_reached, datasets_other)
     for dataset in module.DATASETS
 }
 
