@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ from data_pipelines.oxe.fixtures import known_episodes, write_fixture
 from data_pipelines.oxe.fixtures_converted import DEPTH_COUNTS, camera_from_world
 from data_pipelines.oxe.index import load_index, scan
 from data_pipelines.oxe.loader import OxeLoader
-from data_pipelines.oxe.mixture import MixtureSource
+from data_pipelines.oxe.mixture import MixtureSource, OpenDataset
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.order import BlockOrder, deal, schedule
 from data_pipelines.oxe.registry import get_dataset
@@ -191,6 +192,16 @@ def test_a_stopped_run_goes_on_with_the_same_thousand_samples(folder, processes)
             assert expected.keys() == got.keys()
             for name in expected:
                 np.testing.assert_array_equal(got[name], expected[name])
+
+
+def test_threads_do_not_take_each_others_blocks_away(folder, monkeypatch):
+    read, asked = OpenDataset.read, []
+    monkeypatch.setattr(OpenDataset, "read", lambda self, episode: asked.append(episode) or read(self, episode))
+    loader = make(folder, ("cmu_stretch",), batch_size=48, threads=4, window=3)
+    for _ in range(12):
+        next(loader)
+    # An epoch is 9 episodes of 8 samples, and up to 8 batches are made ahead.
+    assert len(asked) <= 9 * math.ceil((12 + 8) * 48 / 72) + 9
 
 
 def test_a_position_of_other_data_is_refused(folder):

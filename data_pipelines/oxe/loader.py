@@ -48,7 +48,9 @@ class OxeLoader(Iterator[Sample]):
             what a batch needs of Python itself keeps others waiting.
         The order depends on `seed` and the config only: not on processes, threads or where a run was interrupted.
         """
-        self.source = MixtureSource(config, seed, progress)
+        num_threads = min(4, os.cpu_count() or 1) if num_threads is None else num_threads
+        ahead = 2 * num_threads
+        self.source = MixtureSource(config, seed, progress, max(ahead, 1) * batch_size * process_count)
         command = f"python -m data_pipelines.oxe vocabulary OUT --folder {config.folder} --mixture"
         check_words(config.folder, self.source.words, tokenizer, f"{command} {' '.join(config.mixture)}")
         if encoding.use_points:
@@ -63,8 +65,7 @@ class OxeLoader(Iterator[Sample]):
         self.left_out = _Reported(self.source.left_out)
         to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self.left_out.append)
         batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
-        num_threads = min(4, os.cpu_count() or 1) if num_threads is None else num_threads
-        options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=2 * num_threads)
+        options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=ahead)
         dataset = batches.map(to_batch).to_iter_dataset(options)
         self._batches: grain.DatasetIterator[Sample] = iter(dataset)
 

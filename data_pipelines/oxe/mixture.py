@@ -1,6 +1,7 @@
 """Datasets opened and mixed: random access to the samples of an endless stream, with pictures still encoded."""
 
 import dataclasses
+import math
 import operator
 import threading
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ import numpy as np
 
 from data_pipelines.oxe.dataset import OxeDataset
 from data_pipelines.oxe.index import Index, load_index, main_view
-from data_pipelines.oxe.order import BlockOrder, deal, schedule
+from data_pipelines.oxe.order import BlockOrder, deal, recent, schedule
 from data_pipelines.oxe.registry import get_dataset, get_mixture
 from data_pipelines.oxe.targets import Targets, make_targets, why_unsupported
 from data_pipelines.rlds import files
@@ -109,11 +110,11 @@ class OpenDataset:
 
 
 class Stream:
-    """One stream's samples of one dataset; at most two blocks of episodes are in memory."""
+    """One stream's samples of one dataset; at most `keep` blocks of episodes are in memory."""
 
-    def __init__(self, source: OpenDataset, episodes: np.ndarray, window: int, seed: list[int]):
-        self._source, self._episodes = source, episodes
-        self._order = BlockOrder(source.index.samples[episodes], window, seed)
+    def __init__(self, source: OpenDataset, episodes: np.ndarray, window: int, seed: list[int], keep: int):
+        self._source, self._episodes, self._keep = source, episodes, keep
+        self._order = BlockOrder(source.index.samples[episodes], window, seed, keep)
         self._blocks: dict[tuple[int, int], dict[int, list[EncodedSample]]] = {}
         self._lock = threading.Lock()
 
@@ -121,11 +122,8 @@ class Stream:
         """The stream's sample of that number, counted through all epochs."""
         with self._lock:
             block, episode, place = self._order.locate(number)
-            if block not in self._blocks:
-                while len(self._blocks) >= 2:
-                    del self._blocks[next(iter(self._blocks))]
-                self._blocks[block] = {}
-            loaded = self._blocks[block]
+            self._blocks.setdefault(block, {})
+            loaded = recent(self._blocks, block, self._keep)
             if episode not in loaded:
                 loaded[episode] = self._source.read(int(self._episodes[episode]))
             return loaded[episode][place]
@@ -137,7 +135,8 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
     Number i belongs to stream i mod `config.streams`. A stream has its own episodes of every dataset.
     """
 
-    def __init__(self, config: OxeConfig, seed: int, progress: bool = True):
+    def __init__(self, config: OxeConfig, seed: int, progress: bool = True, at_once: int = 1):
+        """at_once: of how many successive numbers threads may ask for any at a time; no record is then read twice."""
         self.config, self.seed = config, seed
         self.datasets, self.weights = open_mixture(config, progress)
         self.shares = shares_of(self.datasets, self.weights)
@@ -153,7 +152,10 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
                     f"{source.build.folder}: {len(source.index.samples)} usable episodes cannot be dealt to"
                     f" {config.streams} streams; lower `streams` to that, or leave the dataset out"
                 )
-            made = [Stream(source, episodes, window, [seed, number, i]) for i, episodes in enumerate(dealt)]
+            # As many blocks as those numbers can span: with fewer, threads would take each other's away.
+            spanned = at_once / config.streams * self.shares[number] / (window * source.index.samples.mean())
+            keep = 2 + math.ceil(spanned)
+            made = [Stream(source, episodes, window, [seed, number, i], keep) for i, episodes in enumerate(dealt)]
             self._streams.append(made)
 
     def __len__(self) -> int:

@@ -5,8 +5,12 @@ in random order. Which dataset a number belongs to is a schedule that repeats, i
 """
 
 import bisect
+from typing import TypeVar
 
 import numpy as np
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 
 def schedule(shares: np.ndarray, seed: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -39,11 +43,11 @@ def deal(episodes: int, streams: int, seed: list[int]) -> list[np.ndarray]:
 class BlockOrder:
     """The order of one stream's samples of one dataset.
 
-    samples: int (E,), of each episode. window: episodes a block.
+    samples: int (E,), of each episode. window: episodes a block. keep: how many blocks' orders are remembered.
     """
 
-    def __init__(self, samples: np.ndarray, window: int, seed: list[int]):
-        self._samples, self._window, self._seed = samples, window, seed
+    def __init__(self, samples: np.ndarray, window: int, seed: list[int], keep: int = 2):
+        self._samples, self._window, self._seed, self._keep = samples, window, seed, keep
         self.num_samples = int(samples.sum())
         self._epochs: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._blocks: dict[tuple[int, int], np.ndarray] = {}
@@ -64,17 +68,19 @@ class BlockOrder:
         if epoch not in self._epochs:
             order = np.random.default_rng([*self._seed, epoch]).permutation(len(self._samples))
             ends = np.concatenate([[0], np.cumsum(self._samples[order])])
-            _keep_last(self._epochs, epoch, (order, ends[:-1][:: self._window]))
-        return self._epochs[epoch]
+            self._epochs[epoch] = order, ends[:-1][:: self._window]
+        return recent(self._epochs, epoch, self._keep)
 
     def _shuffled(self, epoch: int, block: int, size: int) -> np.ndarray:
         if (epoch, block) not in self._blocks:
             order = np.random.default_rng([*self._seed, epoch, block, 1]).permutation(size)
-            _keep_last(self._blocks, (epoch, block), order)
-        return self._blocks[epoch, block]
+            self._blocks[epoch, block] = order
+        return recent(self._blocks, (epoch, block), self._keep)
 
 
-def _keep_last(table: dict, key, value, keep: int = 2) -> None:
-    table[key] = value
+def recent(table: dict[Key, Value], key: Key, keep: int) -> Value:
+    """The entry of `key`, all but the `keep` entries that were last asked for being dropped."""
+    value = table[key] = table.pop(key)
     while len(table) > keep:
         del table[next(iter(table))]
+    return value
