@@ -1,7 +1,6 @@
 """Datasets opened and mixed: random access to the samples of an endless stream, with pictures still encoded."""
 
 import dataclasses
-import math
 import operator
 import threading
 from collections.abc import Sequence
@@ -136,7 +135,7 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
     """
 
     def __init__(self, config: OxeConfig, seed: int, progress: bool = True, at_once: int = 1):
-        """at_once: of how many successive numbers threads may ask for any at a time; no record is then read twice."""
+        """at_once: of how many successive numbers threads may ask for any; few records are then read twice."""
         self.config, self.seed = config, seed
         self.datasets, self.weights = open_mixture(config, progress)
         self.shares = shares_of(self.datasets, self.weights)
@@ -152,9 +151,10 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
                     f"{source.build.folder}: {len(source.index.samples)} usable episodes cannot be dealt to"
                     f" {config.streams} streams; lower `streams` to that, or leave the dataset out"
                 )
-            # As many blocks as those numbers can span: with fewer, threads would take each other's away.
+            # As many blocks as those numbers can span, and some more since blocks differ in size: with fewer, threads
+            # would take each other's away.
             spanned = at_once / config.streams * self.shares[number] / (window * source.index.samples.mean())
-            keep = 2 + math.ceil(spanned)
+            keep = 2 + int(1.5 * spanned)
             made = [Stream(source, episodes, window, [seed, number, i], keep) for i, episodes in enumerate(dealt)]
             self._streams.append(made)
 
