@@ -81,8 +81,8 @@ def kill_at_random(process: subprocess.Popen[bytes], run: Path, rng: np.random.G
     kind = str(rng.choice(["start", "step", "step", "save", "save"]))
     began = time.monotonic()
     if kind == "start":
-        delay = rng.uniform(0, 15)
-        wait_for(process, lambda: time.monotonic() - began > delay)
+        delay, before = rng.uniform(0, 15), last_step(run)
+        wait_for(process, lambda: time.monotonic() - began > delay or last_step(run) > before)
     elif kind == "step":
         target = last_step(run) + int(rng.integers(1, 2 * CHECKPOINT_EVERY))
         wait_for(process, lambda: last_step(run) >= target)
@@ -112,8 +112,8 @@ def arrays_of(run: Path, step: int) -> list[np.ndarray]:
 
 
 def main(options: Options, folder: Path) -> int:
-    # A step kill advances by 4 saved steps on average, a kill during a save by none; twice that is left over.
-    steps = CHECKPOINT_EVERY * (options.kills + 3)
+    # A step kill advances by 4 saved steps on average, a kill during a save by what a quick machine does in 0.3 s.
+    steps = CHECKPOINT_EVERY * (2 * options.kills + 3)
     calm = start(folder, "calm", steps)
     if calm.wait() != 0:
         raise UserError(f"the run left alone failed; see {folder / 'calm.log'}")
