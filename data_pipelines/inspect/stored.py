@@ -115,14 +115,12 @@ def _section(episode: RldsEpisode, motion: Motion | None, build: RldsBuild, data
     """The registry's view, or all colour pictures; the motion where it is known; the texts of the first step."""
     steps = [(path, feature) for path, feature in _features(build) if path.startswith("steps/")]
     views = [path for path, feature in steps if isinstance(feature, Image) and image_format(feature).shape[-1] == 3]
-    bgr = False
     if dataset is not None:
         views = [f"steps/observation/{dataset.images[main_view(dataset)]}"]
-        bgr = main_view(dataset) in dataset.bgr
     drawn: list[tuple[str, np.ndarray]] = []
     for view in views if episode.num_steps else []:
         chosen = np.unique(np.linspace(0, episode.num_steps - 1, MAX_STRIP_FRAMES).round().astype(int))
-        frames = [episode.image(view, int(step), bgr) for step in chosen]
+        frames = [episode.image(view, int(step)) for step in chosen]
         height, width = frames[0].shape[:2]
         drawn.append((view, film_strip([cv2.resize(frame, (width, height)) for frame in frames])))
     if motion is not None:

@@ -28,14 +28,14 @@ BUCKET = "gs://gresearch/robotics"
 SUFFIX = "_converted_externally_to_rlds"
 _SCALED = "actions are scaled to -1..1: only reached poses are metric"
 _WRIST: dict[View, str] = {"primary": "image", "wrist": "wrist_image"}
-_IMAGE: dict[View, str] = {"primary": "image"}
+IMAGE: dict[View, str] = {"primary": "image"}
 _BGR: tuple[View, ...] = ("primary", "wrist")
 OPENING_DOUBTED = "unsure: thu-ml/RoboticsDiffusionTransformer takes 1 for closed, octo and openvla for open, as here"
 _QUATERNION_DOUBTED = "unsure: the order of the quaternion is not published"
 _EXCHANGED = "red and blue are exchanged in all pictures"
 
 
-def _dataset(
+def converted(
     name: str,
     hz: float,
     images: dict[View, str],
@@ -44,16 +44,17 @@ def _dataset(
     published: str = "0.1.0",
     **options,
 ) -> OxeDataset:
+    """One that is in the bucket under its own name. published: its version there."""
     source = f"{BUCKET}/{name}/{published}"
     return OxeDataset(name, hz, source, images, arms, notes=notes, **options)
 
 
-def _closing(stop: int) -> Column:
-    """A command of -1 for open and +1 for closed in the column before `stop`; 0 is on the way from 1 to -1."""
+def closing(stop: int) -> Column:
+    """A command of -1 or 0 for open and 1 for closed in the column before `stop`."""
     return openness(read("action", stop - 1, stop), 1, 0)
 
 
-def _opening(start: int) -> Column:
+def opening(start: int) -> Column:
     """A command of 0 for closed and 1 for open."""
     return openness(read("action", start, start + 1), 0, 1)
 
@@ -61,13 +62,13 @@ def _opening(start: int) -> Column:
 def _state_matrix(name: str, hz: float, *further: str, **options) -> OxeDataset:
     """7 joints, the gripper's width and the hand's 4 x 4 pose as state (VIOLA's and LIBERO's robot stack)."""
     arm = Arm(
-        gripper=_closing(7),
+        gripper=closing(7),
         pose=pose(read("observation/state", 8, 24), "matrix"),
         action=delta(read("action", 0, 6), "rpy"),
         gripper_state=openness(read("observation/state", 7, 8), 0, FRANKA_WIDTH),
     )
     notes = ("the state's last 16 columns are the hand's pose, which octo and openvla leave unread", _SCALED)
-    return _dataset(name, hz, _WRIST, arm, notes=(*notes, *further), **options)
+    return converted(name, hz, _WRIST, arm, notes=(*notes, *further), **options)
 
 
 def _finger_distance(episode: RldsEpisode) -> np.ndarray:
@@ -82,35 +83,35 @@ def _velocity_gripper(episode: RldsEpisode) -> np.ndarray:
 _MANISKILL_POSE = pose(read("observation/tcp_pose"), "wxyz")
 
 DATASETS = [
-    _dataset(
+    converted(
         f"stanford_kuka_multimodal_dataset{SUFFIX}",
         20,
-        _IMAGE,
+        IMAGE,
         Arm(
-            gripper=_opening(3),
+            gripper=opening(3),
             pose=pose(join(read("observation/ee_position"), read("observation/ee_orientation")), "xyzw"),
             action=delta(read("action", 0, 3), "none"),
         ),
         notes=("the peg is held throughout", "depth comes without a camera", _QUATERNION_DOUBTED),
     ),
-    _dataset(
+    converted(
         f"nyu_rot_dataset{SUFFIX}",
         3,
-        _IMAGE,
+        IMAGE,
         Arm(
-            gripper=openness(read("action", 6, 7), 1, 0),
+            gripper=closing(7),
             pose=pose(read("observation/state", 0, 6), "rpy"),
             action=delta(read("action", 0, 6), "rpy"),
             gripper_state=openness(read("observation/state", 6, 7), 1, 0),
         ),
         notes=("0 is open and 1 closed, in state and action: octo and openvla keep it the wrong way round",),
     ),
-    _dataset(
+    converted(
         f"stanford_hydra_dataset{SUFFIX}",
         10,
         _WRIST,
         Arm(
-            gripper=openness(read("action", 6, 7), 1, 0),
+            gripper=closing(7),
             pose=pose(join(read("observation/state", 0, 3), read("observation/state", 7, 10)), "rpy"),
             action=delta(read("action", 0, 6), "rpy"),
         ),
@@ -119,18 +120,18 @@ DATASETS = [
     ),
     _state_matrix(f"austin_buds_dataset{SUFFIX}", 20),
     _state_matrix("utaustin_mutex", 20, _EXCHANGED, bgr=_BGR),
-    _dataset(
+    converted(
         f"nyu_franka_play_dataset{SUFFIX}",
         3,
         {"primary": "image", "secondary": "image_additional_view"},
         Arm(
-            gripper=_opening(13),
+            gripper=opening(13),
             pose=pose(read("observation/state", 7, 13), "rpy"),
             action=delta(read("action", 7, 13), "rpy"),
         ),
         notes=("the action starts with 7 joint velocities and ends with a flag", "depth comes without a camera"),
     ),
-    _dataset(
+    converted(
         f"maniskill_dataset{SUFFIX}",
         20,
         _WRIST,
@@ -149,23 +150,23 @@ DATASETS = [
             "calibrated depth: the one dataset that can feed the 3D path",
         ),
     ),
-    _dataset(
+    converted(
         f"furniture_bench_dataset{SUFFIX}",
         10,
         _WRIST,
         Arm(
-            gripper=_closing(8),
+            gripper=closing(8),
             pose=pose(read("observation/state", 0, 7), "xyzw"),
             action=delta(read("action", 0, 7), "xyzw"),
             gripper_state=openness(read("observation/state", 34, 35), 0, FRANKA_WIDTH),
         ),
         notes=("the action's rotation is a quaternion",),
     ),
-    _dataset(
+    converted(
         f"cmu_franka_exploration_dataset{SUFFIX}",
         10,
         {"primary": "highres_image"},
-        Arm(gripper=_opening(6), action=delta(read("action", 0, 3), "none")),
+        Arm(gripper=opening(6), action=delta(read("action", 0, 3), "none")),
         metric=False,
         notes=(
             "no robot state; the units of actions are not told",
@@ -174,21 +175,21 @@ DATASETS = [
             "the last column is a flag",
         ),
     ),
-    _dataset(
+    converted(
         f"ucsd_kitchen_dataset{SUFFIX}",
         2,
-        _IMAGE,
-        Arm(gripper=_opening(6), pose=pose(read("action", 0, 6), "rpy", 1e-3, np.pi / 180)),
+        IMAGE,
+        Arm(gripper=opening(6), pose=pose(read("action", 0, 6), "rpy", 1e-3, np.pi / 180)),
         notes=(
             "the action is a pose in millimetres and degrees (openvla's published statistics: mean x 410): it stands"
             " for the pose, since the state is joints only",
             OPENING_DOUBTED,
         ),
     ),
-    _dataset(
+    converted(
         f"ucsd_pick_and_place_dataset{SUFFIX}",
         3,
-        _IMAGE,
+        IMAGE,
         Arm(
             gripper=following(_finger_distance),
             pose=pose(read("observation/state", 0, 6), "rpy", 0.1),
@@ -201,36 +202,36 @@ DATASETS = [
             " reached poses are metric, and the fingers' distance of the next step is the command",
         ),
     ),
-    _dataset(
+    converted(
         f"austin_sailor_dataset{SUFFIX}",
         20,
         _WRIST,
         Arm(
-            gripper=_closing(7),
+            gripper=closing(7),
             pose=pose(read("observation/state", 0, 7), "xyzw"),
             action=delta(read("action", 0, 6), "rpy"),
             gripper_state=openness(read("observation/state_gripper"), 0, 0.077),
         ),
         notes=(_SCALED,),
     ),
-    _dataset(
+    converted(
         f"austin_sirius_dataset{SUFFIX}",
         20,
         _WRIST,
         Arm(
-            gripper=_closing(7),
+            gripper=closing(7),
             pose=pose(read("observation/state_ee"), "matrix"),
             action=delta(read("action", 0, 6), "rpy"),
             gripper_state=openness(read("observation/state_gripper"), 0, 0.077),
         ),
         notes=("`state` is joints, which octo and openvla take for a pose: state_ee is the pose", _SCALED),
     ),
-    _dataset(
+    converted(
         "robo_net",
         1,
         {"primary": "image", "secondary": "image1"},
         Arm(
-            gripper=_closing(5),
+            gripper=closing(5),
             pose=pose(read("observation/state", 0, 4), "yaw"),
             action=delta(read("action", 0, 4), "yaw"),
             gripper_state=openness(read("observation/state", 4, 5), 0, 1),
@@ -244,7 +245,7 @@ DATASETS = [
             "states are scaled to each robot's workspace",
         ),
     ),
-    _dataset(
+    converted(
         f"berkeley_mvp{SUFFIX}",
         5,
         {"wrist": "hand_image"},
@@ -255,7 +256,7 @@ DATASETS = [
         ),
         notes=("actions are joints: displacements come from reached poses", "wrist camera only"),
     ),
-    _dataset(
+    converted(
         f"berkeley_rpt{SUFFIX}",
         30,
         {"wrist": "hand_image"},
@@ -272,10 +273,10 @@ DATASETS = [
             "wrist camera only",
         ),
     ),
-    _dataset(
+    converted(
         f"kaist_nonprehensile{SUFFIX}",
         10,
-        _IMAGE,
+        IMAGE,
         Arm(
             gripper=constant(0.0),
             pose=pose(read("observation/state", 14, 21), "xyzw"),
@@ -283,10 +284,10 @@ DATASETS = [
         ),
         notes=("rotations are axis-angle; 14 columns of gains follow", "it pushes with a closed gripper"),
     ),
-    _dataset(
+    converted(
         f"stanford_mask_vit{SUFFIX}",
         1,
-        _IMAGE,
+        IMAGE,
         Arm(
             gripper=openness(read("action", 4, 5), 1, -1),
             pose=pose(read("observation/end_effector_pose", 0, 4), "yaw"),
@@ -298,7 +299,7 @@ DATASETS = [
             "-1 opens and 1 closes: octo and openvla keep it the wrong way round",
         ),
     ),
-    _dataset(
+    converted(
         f"stanford_robocook{SUFFIX}",
         5,
         {"primary": "image_1", "secondary": "image_2"},
@@ -314,12 +315,12 @@ DATASETS = [
             "depth and extrinsics come without intrinsics",
         ),
     ),
-    _dataset(
+    converted(
         "imperialcollege_sawyer_wrist_cam",
         10,
         _WRIST,
         Arm(
-            gripper=_opening(6),
+            gripper=opening(6),
             action=delta(read("action", 0, 6), "ypr"),
             gripper_state=openness(read("observation/state"), 0, 1),
         ),
@@ -330,12 +331,12 @@ DATASETS = [
             OPENING_DOUBTED,
         ),
     ),
-    _dataset(
+    converted(
         f"iamlab_cmu_pickup_insert{SUFFIX}",
         20,
         _WRIST,
         Arm(
-            gripper=_opening(7),
+            gripper=opening(7),
             pose=pose(preceding(read("action", 0, 7)), "wxyz"),
             gripper_state=openness(read("observation/state", 7, 8), 0, 1),
         ),
@@ -346,7 +347,7 @@ DATASETS = [
             "the quaternion's real part is first; octo and openvla take it for the last",
         ),
     ),
-    _dataset(
+    converted(
         "uiuc_d3field",
         1,
         {"primary": "image_1", "secondary": "image_2"},
@@ -357,7 +358,7 @@ DATASETS = [
         ),
         notes=("octo and openvla report the data broken", "no gripper is told: always closed"),
     ),
-    _dataset(
+    converted(
         "berkeley_fanuc_manipulation",
         10,
         _WRIST,
@@ -375,7 +376,7 @@ DATASETS = [
             _EXCHANGED,
         ),
     ),
-    _dataset(
+    converted(
         "cmu_playing_with_food",
         10,
         {"primary": "image", "wrist": "finger_vision_1"},
@@ -388,12 +389,12 @@ DATASETS = [
             _EXCHANGED,
         ),
     ),
-    _dataset(
+    converted(
         "cmu_play_fusion",
         5,
-        _IMAGE,
+        IMAGE,
         Arm(
-            gripper=_opening(7),
+            gripper=opening(7),
             action=delta(read("action", 0, 7), "xyzw"),
             gripper_state=openness(read("observation/state", 7, 8), 0, 0.085),
         ),
@@ -404,12 +405,12 @@ DATASETS = [
             "the gripper's state is its width, up to 85 mm as thu-ml/RoboticsDiffusionTransformer has it",
         ),
     ),
-    _dataset(
+    converted(
         "cmu_stretch",
         10,
-        _IMAGE,
+        IMAGE,
         Arm(
-            gripper=_opening(6),
+            gripper=opening(6),
             pose=pose(read("observation/state", 0, 3), "none"),
             action=delta(read("action", 0, 6), "rpy"),
             gripper_state=openness(read("observation/state", 3, 4), 0, 1),

@@ -6,7 +6,7 @@ octo's and openvla's ``oxe/transforms`` and from those whom the notes name.
 """
 
 from data_pipelines.oxe.dataset import OxeDataset, View
-from data_pipelines.oxe.datasets_converted import BUCKET, OPENING_DOUBTED, SUFFIX
+from data_pipelines.oxe.datasets_converted import IMAGE, OPENING_DOUBTED, SUFFIX, closing, converted, opening
 from data_pipelines.oxe.motion import Arm, Column, RotationKind, following, openness, pose, read
 
 _UNCLEAR = "whether the action is a pose or a displacement is unclear: displacements come from reached poses"
@@ -17,18 +17,6 @@ _WATCHED = (
 )
 
 
-def _dataset(
-    name: str, hz: float, *arms: Arm, images: dict[View, str] | None = None, notes: tuple[str, ...] = ()
-) -> OxeDataset:
-    source = f"{BUCKET}/{name}/0.1.0"
-    return OxeDataset(name, hz, source, images or {"primary": "image"}, arms, notes=(_UNCLEAR, *notes))
-
-
-def _opening(start: int) -> Column:
-    """A command of 0 for closed and 1 for open."""
-    return openness(read("action", start, start + 1), 0, 1)
-
-
 def _reached(
     name: str,
     hz: float,
@@ -37,12 +25,13 @@ def _reached(
     gripper: Column | None = None,
     state: str = "observation/state",
     scale: float = 1.0,
-    **options,
+    images: dict[View, str] = IMAGE,
+    notes: tuple[str, ...] = (),
 ) -> OxeDataset:
     """One arm, whose pose is the first six columns of the state: `scale` metres, radians."""
-    gripper = _opening(6) if gripper is None else gripper
+    gripper = opening(6) if gripper is None else gripper
     arm = Arm(gripper=gripper, pose=pose(read(state, 0, 6), rotation, scale), gripper_state=gripper_state)
-    return _dataset(name, hz, arm, **options)
+    return converted(name, hz, images, arm, notes=(_UNCLEAR, *notes))
 
 
 def _pr2(name: str) -> OxeDataset:
@@ -62,7 +51,7 @@ DATASETS = [
         10,
         "ypr",
         images={"primary": "image", "secondary": "image2", "wrist": "hand_image"},
-        gripper=openness(read("action", 6, 7), 1, 0),
+        gripper=closing(7),
         state="observation/end_effector_pose",
         notes=(
             "angles come as yaw, pitch, roll",
@@ -70,12 +59,14 @@ DATASETS = [
             " openvla keep it the wrong way round",
         ),
     ),
-    _dataset(
+    converted(
         f"utokyo_xarm_bimanual{SUFFIX}",
         10,
-        Arm(gripper=_opening(6), pose=pose(read("observation/pose_l"), "ypr")),
-        Arm(gripper=_opening(13), pose=pose(read("observation/pose_r"), "ypr")),
+        IMAGE,
+        Arm(gripper=opening(6), pose=pose(read("observation/pose_l"), "ypr")),
+        Arm(gripper=opening(13), pose=pose(read("observation/pose_r"), "ypr")),
         notes=(
+            _UNCLEAR,
             "two arms, left first: octo and openvla throw the left one away",
             "angles come as yaw, pitch, roll",
             OPENING_DOUBTED,
@@ -87,25 +78,15 @@ DATASETS = [
         "rpy",
         notes=("unsure: the measured gripper is always 0, which thu-ml/RoboticsDiffusionTransformer takes for open",),
     ),
-    _reached(
-        f"dlr_sara_pour{SUFFIX}",
-        10,
-        "zxy",
-        gripper=openness(read("action", 6, 7), 1, 0),
-        notes=(_ZXY, _WATCHED),
-    ),
-    _reached(
-        f"dlr_sara_grid_clamp{SUFFIX}",
-        10,
-        "zxy",
-        gripper=openness(read("action", 6, 7), 1, 0),
-        notes=(_ZXY, _WATCHED),
+    *(
+        _reached(f"dlr_sara_{task}{SUFFIX}", 10, "zxy", gripper=closing(7), notes=(_ZXY, _WATCHED))
+        for task in ("pour", "grid_clamp")
     ),
     _reached(
         f"dlr_edan_shared_control{SUFFIX}",
         5,
         "zxy",
-        gripper=openness(read("action", 6, 7), 1, 0),
+        gripper=closing(7),
         gripper_state=openness(read("observation/state", 6, 7), 1, 0),
         notes=(_ZXY,),
     ),

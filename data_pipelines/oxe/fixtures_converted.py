@@ -1,4 +1,7 @@
-"""Builds of `datasets_converted` and `datasets_reached`: features as on each dataset's page of https://www.tensorflow.org/datasets/catalog."""
+"""Builds of `datasets_converted` and `datasets_reached`.
+
+Features as on each dataset's page of https://www.tensorflow.org/datasets/catalog.
+"""
 
 import dataclasses
 

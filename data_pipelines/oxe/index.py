@@ -17,8 +17,8 @@ import numpy as np
 from tqdm import tqdm
 
 from data_pipelines.oxe import dataset as dataset_module
-from data_pipelines.oxe import datasets_converted, datasets_other, datasets_reached, datasets_rtx, targets
 from data_pipelines.oxe import motion as motion_module
+from data_pipelines.oxe import registry, targets
 from data_pipelines.oxe.dataset import OxeDataset
 from data_pipelines.oxe.targets import make_targets
 from data_pipelines.records import DataError
@@ -174,7 +174,7 @@ def _leave_out(error: DataError, where: str, left_out: list[tuple[str, str]], co
 
 def _fingerprint(build: RldsBuild, dataset: OxeDataset, config: OxeConfig) -> str:
     """Changes where the files, the features, the code that reads them or the targets change."""
-    code = [dataset_module, datasets_converted, datasets_other, datasets_reached, datasets_rtx, motion_module, targets]
+    code = [dataset_module, *registry.MODULES, motion_module, targets]
     parts = [
         str(VERSION),
         json.dumps(build.features_json, sort_keys=True),

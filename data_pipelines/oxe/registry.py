@@ -4,15 +4,13 @@ import difflib
 
 from data_pipelines.oxe import datasets_converted, datasets_other, datasets_reached, datasets_rtx
 from data_pipelines.oxe.dataset import OxeDataset
+from data_pipelines.oxe.datasets_converted import SUFFIX
 from dsvla_jax.errors import UserError
 
-DATASETS: dict[str, OxeDataset] = {
-    dataset.name: dataset
-    for module in (datasets_rtx, datasets_converted, datasets_reached, datasets_other)
-    for dataset in module.DATASETS
-}
+MODULES = (datasets_rtx, datasets_converted, datasets_reached, datasets_other)
+"""Where the datasets are described."""
+DATASETS: dict[str, OxeDataset] = {dataset.name: dataset for module in MODULES for dataset in module.DATASETS}
 
-_CONVERTED = "_converted_externally_to_rlds"
 _SOUP: dict[str, float] = {
     "fractal20220817_data": 0.54087122203,
     "kuka": 0.8341046294,
@@ -25,15 +23,15 @@ _SOUP: dict[str, float] = {
     "berkeley_autolab_ur5": 2.0,
     "toto": 1.0,
     "language_table": 0.1,
-    f"stanford_hydra_dataset{_CONVERTED}": 2.0,
-    f"austin_buds_dataset{_CONVERTED}": 1.0,
-    f"nyu_franka_play_dataset{_CONVERTED}": 3.0,
-    f"furniture_bench_dataset{_CONVERTED}": 0.1,
-    f"ucsd_kitchen_dataset{_CONVERTED}": 2.0,
-    f"austin_sailor_dataset{_CONVERTED}": 1.0,
-    f"austin_sirius_dataset{_CONVERTED}": 1.0,
-    f"dlr_edan_shared_control{_CONVERTED}": 1.0,
-    f"iamlab_cmu_pickup_insert{_CONVERTED}": 1.0,
+    f"stanford_hydra_dataset{SUFFIX}": 2.0,
+    f"austin_buds_dataset{SUFFIX}": 1.0,
+    f"nyu_franka_play_dataset{SUFFIX}": 3.0,
+    f"furniture_bench_dataset{SUFFIX}": 0.1,
+    f"ucsd_kitchen_dataset{SUFFIX}": 2.0,
+    f"austin_sailor_dataset{SUFFIX}": 1.0,
+    f"austin_sirius_dataset{SUFFIX}": 1.0,
+    f"dlr_edan_shared_control{SUFFIX}": 1.0,
+    f"iamlab_cmu_pickup_insert{SUFFIX}": 1.0,
     "utaustin_mutex": 1.0,
     "berkeley_fanuc_manipulation": 2.0,
     "cmu_stretch": 1.0,

@@ -127,10 +127,10 @@ class RldsEpisode:
         except UnicodeDecodeError as error:
             raise DataError(self.where, path, "UTF-8", str(error), _FIX) from error
 
-    def image(self, path: str, step: int, bgr: bool = False) -> np.ndarray:
-        """One decoded image: its own dtype, (H, W, C). bgr: as `ImageFormat` has it."""
+    def image(self, path: str, step: int) -> np.ndarray:
+        """One decoded image: its own dtype, (H, W, C)."""
         return decode_image(
-            self.encoded(path)[step], image_format(self._feature(path), bgr), f"{self.where}, step {step}, {path}"
+            self.encoded(path)[step], image_format(self._feature(path)), f"{self.where}, step {step}, {path}"
         )
 
     def _feature(self, path: str) -> Any:
