@@ -1,235 +1,43 @@
-"""Mixtures: order, resume, targets, statistics, damage, and the calibrated dataset's way into 3D. Known motions."""
+"""Mixtures: targets, texts, pictures and depth of samples whose motion is known, and what is refused."""
 
 import dataclasses
-import json
-import math
-import os
-from types import SimpleNamespace
-from typing import Any
 
-import fsspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tensorflow_datasets.proto import tf_example_pb2
 
 from data_pipelines.oxe.__main__ import vocabulary as write_words
-from data_pipelines.oxe.fixtures import known_episodes, write_fixture
+from data_pipelines.oxe.fixtures import write_fixture
 from data_pipelines.oxe.fixtures_converted import DEPTH_COUNTS, camera_from_world
-from data_pipelines.oxe.index import load_index, scan
 from data_pipelines.oxe.loader import OxeLoader
-from data_pipelines.oxe.mixture import MixtureSource, OpenDataset
 from data_pipelines.oxe.motion import Motion
-from data_pipelines.oxe.order import BlockOrder, deal, schedule
 from data_pipelines.oxe.registry import get_dataset
-from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.oxe.targets import key_frames, make_targets
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
-from data_pipelines.records import DataError
-from data_pipelines.rlds.build import RldsBuild, TFRecordFile
-from data_pipelines.rlds.tfrecord import write_records
 from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
-from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
-from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.errors import UserError
-
-FIVE = ("nyu_rot_dataset_converted_externally_to_rlds=3", "austin_sirius_dataset_converted_externally_to_rlds",
-        "cmu_play_fusion=0.5", "utokyo_pr2_opening_fridge_converted_externally_to_rlds=2",
-        "cmu_stretch=1.5")  # fmt: skip
-MANISKILL = "maniskill_dataset_converted_externally_to_rlds"
-ENCODING = EncodingConfig(image_size=32, patch_size=16, style="compact", max_text_length=64, use_points=False)
-
-
-def names_of(mixture):
-    return [entry.partition("=")[0] for entry in mixture]
+from tests.oxe_mixtures import (
+    ENCODING,
+    FIVE,
+    MANISKILL,
+    answer_of,
+    config_for,
+    make,
+    names_of,
+    scale_of,
+    truth_of,
+    write_datasets,
+)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("oxe")
-    for name in (
-        *names_of(FIVE),
-        MANISKILL,
-        "roboturk",
-        "berkeley_cable_routing",
-        "utokyo_xarm_bimanual_converted_externally_to_rlds",
-    ):
-        write_fixture(folder, name, episodes=9, steps=9)
-    return folder
-
-
-def config_for(folder, mixture=FIVE, **options):
-    return OxeConfig(
-        **{"folder": str(folder), "mixture": mixture, "image_size": 32, "streams": 3, "window": 6, **options}
-    )
-
-
-def make(folder, mixture=FIVE, *, batch_size=4, encoding=ENCODING, seed=0, split=(0, 1), threads=2, **options):
-    return OxeLoader(
-        config_for(folder, mixture, **options),
-        encoding,
-        suite_tokenizer(),
-        batch_size=batch_size,
-        seed=seed,
-        process_index=split[0],
-        process_count=split[1],
-        num_threads=threads,
-        progress=False,
-    )
-
-
-def test_an_epoch_of_a_stream_is_every_sample_once():
-    samples = np.array([3, 1, 7, 2, 5, 4])
-    order = BlockOrder(samples, 2, [0])
-    total = int(samples.sum())
-    epochs = [[order.locate(epoch * total + i)[1:] for i in range(total)] for epoch in range(3)]
-    everything = [(episode, place) for episode, count in enumerate(samples) for place in range(count)]
-    assert all(sorted(epoch) == everything for epoch in epochs)
-    assert epochs[0] != epochs[1] != epochs[2]
-    # Never are more than two episodes open, and another order object finds any number by itself.
-    for start in range(total - 1):
-        blocks = {order.locate(i)[0] for i in (start, start + 1)}
-        assert len(blocks) <= 2
-    assert [BlockOrder(samples, 2, [0]).locate(i)[1:] for i in (40, 3, 17)] == [
-        order.locate(i)[1:] for i in (40, 3, 17)
-    ]
-
-
-def test_episodes_are_dealt_out_once():
-    dealt = deal(23, 4, [1])
-    assert sorted(np.concatenate(dealt).tolist()) == list(range(23))
-
-
-@pytest.mark.parametrize("shares", [[1.0], [0.5, 0.5], [0.001, 0.3, 0.699], [0.05] * 20])
-def test_turns_follow_the_shares_everywhere(shares):
-    shares = np.array(shares)
-    dataset, occurrence = schedule(shares, [0])
-    for number, share in enumerate(shares):
-        turns = dataset == number
-        assert turns.mean() == pytest.approx(share, rel=0.01)
-        np.testing.assert_array_equal(occurrence[turns], np.arange(turns.sum()))
-        passed = np.cumsum(turns) - np.arange(1, len(turns) + 1) * share
-        assert np.abs(passed).max() <= 2
-
-
-def test_an_epoch_of_one_dataset_is_every_frame_once(folder):
-    name = names_of(FIVE)[0]
-    source = MixtureSource(config_for(folder, (name,), streams=1), seed=3, progress=False)
-    expected = sum(episode.num_steps - 1 for episode in known_episodes(name, 9, 9))
-    assert source.num_samples == expected
-    epochs = [[source[epoch * expected + i].where for i in range(expected)] for epoch in range(2)]
-    assert len(set(epochs[0])) == len(set(epochs[1])) == expected
-    assert epochs[0] != epochs[1]
-
-
-def test_an_epoch_of_every_dataset_of_a_mixture_is_every_frame_once(folder):
-    """Of each stream of each dataset, whichever process reads which numbers."""
-    config = config_for(folder)
-    sources = [MixtureSource(config, seed=3, progress=False) for _ in range(3)]
-    drawn: dict[tuple[str, int], list[str]] = {}
-    for number in range(3000):
-        sample = sources[number % 3][number]
-        drawn.setdefault((sample.dataset, number % config.streams), []).append(sample.where)
-    for name in names_of(FIVE):
-        everything: list[str] = []
-        for stream in range(config.streams):
-            told = drawn[name, stream]
-            size = len(set(told))
-            epochs = [told[start : start + size] for start in range(0, len(told) - size + 1, size)]
-            assert len(epochs) >= 2
-            assert all(sorted(epoch) == sorted(set(told)) for epoch in epochs)
-            everything += set(told)
-        assert len(everything) == len(set(everything))
-        assert len(everything) == sum(episode.num_steps - 1 for episode in known_episodes(name, 9, 9))
-
-
-def test_processes_share_out_the_one_stream(folder):
-    source = MixtureSource(config_for(folder), seed=3, progress=False)
-    whole = [source[i].where for i in range(90)]
-    fresh = MixtureSource(config_for(folder), seed=3, progress=False)
-    assert [[fresh[i].where for i in range(p, 90, 3)] for p in range(3)] == [whole[p::3] for p in range(3)]
-    records = [{where.partition(", step")[0] for where in whole[p::3]} for p in range(3)]
-    assert not (records[0] & records[1]) | (records[1] & records[2]) | (records[0] & records[2])
-
-
-@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs Linux's /proc")
-def test_no_file_stays_open(folder):
-    before = len(os.listdir("/proc/self/fd"))
-    loader = make(folder, threads=0)
-    for _ in range(20):
-        next(loader)
-    assert len(os.listdir("/proc/self/fd")) <= before
-
-
-def test_proportions_are_the_weights_times_the_sizes(folder):
-    source = MixtureSource(config_for(folder), seed=0, progress=False)
-    count = 4000
-    drawn = [source[i].dataset for i in range(count)]
-    weights = dict(zip(names_of(FIVE), (3, 1, 0.5, 2, 1.5), strict=True))
-    sizes = {name: sum(episode.num_steps - 1 for episode in known_episodes(name, 9, 9)) for name in weights}
-    total = sum(weights[name] * sizes[name] for name in weights)
-    for name in weights:
-        assert drawn.count(name) / count == pytest.approx(weights[name] * sizes[name] / total, rel=0.01)
-
-
-@pytest.mark.parametrize("processes", [1, 3])
-def test_a_stopped_run_goes_on_with_the_same_thousand_samples(folder, processes):
-    for process in range(processes):
-        split, batches = (process, processes), -(-1000 // (20 * processes))
-        loader = make(folder, batch_size=20, split=split)
-        for _ in range(7 + process):
-            next(loader)
-        state = json.loads(json.dumps(loader.get_state()))
-        resumed = make(folder, batch_size=20, split=split, threads=0)
-        resumed.set_state(state)
-        for _ in range(batches):
-            expected, got = next(loader), next(resumed)
-            assert expected.keys() == got.keys()
-            for name in expected:
-                np.testing.assert_array_equal(got[name], expected[name])
-
-
-def test_threads_do_not_take_each_others_blocks_away(folder, monkeypatch):
-    read, asked = OpenDataset.read, []
-    monkeypatch.setattr(OpenDataset, "read", lambda self, episode: asked.append(episode) or read(self, episode))
-    loader = make(folder, ("cmu_stretch",), batch_size=48, threads=4, window=3)
-    for _ in range(12):
-        next(loader)
-    # An epoch is 9 episodes of 8 samples, and up to 8 batches are made ahead.
-    assert len(asked) <= 9 * math.ceil((12 + 8) * 48 / 72) + 9
-
-
-def test_a_position_of_other_data_is_refused(folder):
-    state = make(folder).get_state()
-    with pytest.raises(DataError, match=r"saved position: data: expected .*; put the same data back"):
-        make(folder, FIVE[:4]).set_state(state)
-    assert set(state["scale"]) == {"low", "high"}
-    with pytest.raises(DataError, match=r"saved position: scale: expected .*; put the same data back"):
-        make(folder, horizon=0.3).set_state(state)
-
-
-def scale_of(loader):
-    assert loader.scale is not None
-    return loader.scale
-
-
-def truth_of(name, where):
-    """The known arms and step of a sample, by the place that it names."""
-    record, _, step = where.partition(", step ")
-    shard = int(record.rpartition("-of-")[0][-5:])
-    number = int(record.rpartition(" ")[2]) + (0 if shard == 0 else 5)
-    known = known_episodes(name, 9, 9)[number]
-    return known, int(step.partition(",")[0])
-
-
-def answer_of(batch, row, arms):
-    tokens = batch["text_tokens"][row][batch["answer_mask"][row]][:-1]
-    return parse_answer(suite_tokenizer().decode([int(token) for token in tokens]), arms, "compact")
+    return write_datasets(tmp_path_factory.mktemp("oxe"))
 
 
 @pytest.mark.parametrize("name", ["nyu_rot_dataset_converted_externally_to_rlds", "berkeley_cable_routing",
@@ -255,25 +63,6 @@ def test_relative_answers_lead_to_where_the_hand_went(folder, name):
             assert np.all(np.abs(moved[i, 3:] - truth[3:]) <= 2.5 * bin_size[3:] + 1e-6)
             gripper = 0 if name == "berkeley_cable_routing" else arm.open[min(end, known.num_steps - 2)]
             assert answer.gripper_open[i] == gripper
-
-
-def test_of_many_frames_evenly_spaced_ones_of_both_arms_make_the_statistics(folder, monkeypatch):
-    name = "utokyo_xarm_bimanual_converted_externally_to_rlds"
-    monkeypatch.setattr("data_pipelines.oxe.index.KEPT_FRAMES", 30)
-    index = scan(RldsBuild(folder / name), get_dataset(name), config_for(folder, (name,)), progress=False)
-    ahead = max(1, round(config_for(folder).horizon * get_dataset(name).hz))
-    frames = []
-    for known in known_episodes(name, 9, 9):
-        for step in range(known.num_steps - 1):
-            end = min(step + ahead, known.num_steps - 1)
-            moved = [
-                (arm.position[end] - arm.position[step], (arm.rotation[end] * arm.rotation[step].inv()).as_rotvec())
-                for arm in known.arms
-            ]
-            frames.append(np.reshape(moved, (2, 6)))
-    assert len(frames) == index.num_samples == 81
-    expected = np.quantile(np.concatenate(frames[::4]), np.linspace(0, 1, 101), axis=0)
-    np.testing.assert_allclose(np.asarray(index.quantiles), expected, atol=1e-5)
 
 
 def test_absolute_answers_are_poses_and_prompts_have_no_keypoint(folder):
@@ -358,37 +147,6 @@ def test_displacements_survive_the_box_and_lead_there():
     assert np.all(scale.from_pose(pose, codec)[:, 5] == np.float32(-0.2))
 
 
-def test_the_scale_is_that_of_the_known_motion(folder):
-    name = names_of(FIVE)[0]
-    loader = make(folder, (name,), horizon=0.0001, streams=1)
-    moved = []
-    for known in known_episodes(name, 9, 9):
-        (arm,) = known.arms
-        turns = (arm.rotation[1:] * arm.rotation[:-1].inv()).as_rotvec()
-        moved.append(np.concatenate([np.diff(arm.position, axis=0), turns], axis=1))
-    low, high = np.quantile(np.concatenate(moved), [0.01, 0.99], axis=0)
-    np.testing.assert_allclose(scale_of(loader).low, low, atol=3e-4)
-    np.testing.assert_allclose(scale_of(loader).high, high, atol=3e-4)
-
-
-def test_the_scale_is_not_that_of_the_rare_steps_of_what_mostly_stands_still():
-    known = SimpleNamespace(metric=True, name="known")
-    moves = np.random.default_rng(0).normal(size=(20_000, 6))
-    moves[:, 3:][np.random.default_rng(1).random((20_000, 3)) > 0.004] = 0
-    rows = np.quantile(moves, np.linspace(0, 1, 101), axis=0)
-    opened: Any = [SimpleNamespace(dataset=known, index=SimpleNamespace(quantiles=rows))]
-    scale = MixtureScale(opened, np.ones(1)).scale
-    for made, at in ((scale.low, 0.01), (scale.high, 0.99)):
-        np.testing.assert_allclose(made, np.quantile(moves, at, axis=0), atol=1e-6)
-
-
-def test_unscaled_data_are_stretched_to_the_metric_range(folder):
-    loader = make(folder, ("roboturk", names_of(FIVE)[0]), streams=1)
-    alone = make(folder, (names_of(FIVE)[0],), streams=1)
-    np.testing.assert_allclose(scale_of(loader).low, scale_of(alone).low, rtol=1e-9)
-    assert make(folder, ("roboturk",), streams=1).scale == DisplacementScale((-1.0,) * 6, (1.0,) * 6)
-
-
 def test_calibrated_depth_feeds_the_3d_path(folder):
     encoding = dataclasses.replace(ENCODING, use_points=True)
     loader = make(folder, (MANISKILL,), encoding=encoding, image_size=64, crop=0.6, streams=1, threads=0)
@@ -423,15 +181,6 @@ def test_a_crop_takes_the_camera_along():
         assert before[1] == pytest.approx(shown_rows[v, u], abs=0.1)
 
 
-def test_exchanged_colours_are_put_right(tmp_path):
-    name = "utaustin_mutex"
-    write_fixture(tmp_path, name, episodes=9, steps=9)
-    loader = make(tmp_path, (name,), streams=1, threads=0, crop=1.0, colour_variation=0.0)
-    for row, picture in enumerate(next(loader)["rgb"]):
-        known, step = truth_of(name, loader.source[row].where)
-        np.testing.assert_allclose(picture.mean((0, 1)), known.colour(step), atol=3)
-
-
 def test_light_varies_colours_and_nothing_else():
     picture = np.random.default_rng(0).integers(0, 256, (8, 8, 3), np.uint8)
     same = vary_light(picture, np.random.default_rng(1), 0.0)
@@ -440,77 +189,6 @@ def test_light_varies_colours_and_nothing_else():
     assert varied.shape == picture.shape
     assert np.abs(varied.astype(int) - picture).mean() > 2
     np.testing.assert_array_equal(varied, vary_light(picture, np.random.default_rng(1), 0.3))
-
-
-def test_statistics_are_kept_until_the_data_change(tmp_path, monkeypatch):
-    write_fixture(tmp_path, "cmu_stretch", episodes=4, steps=6)
-    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
-    config = config_for(tmp_path, ("cmu_stretch",))
-    first = load_index(build, dataset, config, progress=False)
-    kept = next((tmp_path / "cmu_stretch" / "0.1.0").glob("dsvla_index_*.json"))
-    with monkeypatch.context() as patch:
-        patch.setattr("data_pipelines.oxe.index.scan", lambda *_: pytest.fail("scanned again"))
-        again = load_index(build, dataset, config, progress=False)
-    np.testing.assert_array_equal(again.quantiles, first.quantiles)
-    np.testing.assert_array_equal(again.record, first.record)
-    other = load_index(build, dataset, dataclasses.replace(config, horizon=0.1), progress=False)
-    assert first.quantiles is not None
-    assert other.quantiles is not None
-    assert not np.array_equal(other.quantiles, first.quantiles)
-    assert kept.exists()
-    text = kept.read_text()
-    kept.write_text(text[:100])
-    load_index(build, dataset, config, progress=False)
-    assert kept.read_text() == text
-    elsewhere = dataclasses.replace(config, cache=str(tmp_path / "cache"))
-    load_index(build, dataset, elsewhere, progress=False)
-    assert list((tmp_path / "cache").glob("*.json"))
-
-
-@pytest.mark.parametrize("remote", [False, True])
-def test_statistics_are_made_again_where_only_numbers_changed(tmp_path, remote):
-    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6, shards=1)
-    folder = tmp_path / "cmu_stretch" / "0.1.0"
-    config = config_for(tmp_path, ("cmu_stretch",), cache=str(tmp_path / "cache"))
-
-    def quantiles():
-        if remote:
-            fsspec.filesystem("memory").put(f"{folder}/", "/corrected/0.1.0/", recursive=True)
-        build = RldsBuild("memory://corrected" if remote else folder)
-        return np.asarray(load_index(build, get_dataset("cmu_stretch"), config, progress=False).quantiles)
-
-    before = quantiles()
-    shard = folder / "cmu_stretch-train.tfrecord-00000-of-00001"
-    records = TFRecordFile(str(shard))
-    examples = [tf_example_pb2.Example.FromString(records.read(number)) for number in range(len(records))]
-    for example in examples:
-        state = example.features.feature["steps/observation/state"].float_list.value
-        state[:] = [2 * number for number in state]
-    size = shard.stat().st_size
-    write_records(shard, [example.SerializeToString() for example in examples])
-    assert shard.stat().st_size == size
-    np.testing.assert_allclose(quantiles()[:, :3], 2 * before[:, :3], rtol=1e-5)
-
-
-def test_processes_of_the_same_number_may_write_the_index_at_once(tmp_path, monkeypatch):
-    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6)
-    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
-    replace = os.replace
-
-    def meanwhile(source, target):
-        monkeypatch.setattr("os.replace", replace)
-        load_index(build, dataset, config_for(tmp_path), progress=False)
-        replace(source, target)
-
-    monkeypatch.setattr("os.replace", meanwhile)
-    assert len(load_index(build, dataset, config_for(tmp_path), progress=False).samples) == 2
-    assert len(list((tmp_path / "cmu_stretch" / "0.1.0").glob("dsvla_index_*"))) == 1
-
-
-def test_no_picture_is_decoded_for_statistics(tmp_path, monkeypatch):
-    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6)
-    monkeypatch.setattr("cv2.imdecode", lambda *_: pytest.fail("decoded"))
-    scan(RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch"), config_for(tmp_path), progress=False)
 
 
 def test_unknown_words_need_a_vocabulary(folder, tmp_path, capsys):
