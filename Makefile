@@ -46,7 +46,7 @@ bench: setup  ## list the checks that take minutes
 lint: setup  ## ruff and pyright
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
-	$(PY) -m pyright
+	$(PY) -m pyright --pythonpath $(PY)
 
 format: setup  ## format the code
 	$(PY) -m ruff format .

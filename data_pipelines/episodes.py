@@ -14,7 +14,6 @@ import numpy as np
 from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
 
 from data_pipelines.records import (
-    DataError,
     Episode,
     Frame,
     decode_frame,
@@ -23,6 +22,7 @@ from data_pipelines.records import (
     unpack_episode,
 )
 from dsvla_jax.digests import file_digest
+from dsvla_jax.errors import DataError
 
 FORMAT_NAME = "dsvla-episodes"
 FORMAT_VERSION = 1

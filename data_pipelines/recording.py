@@ -9,23 +9,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from data_pipelines.records import MAX_DEPTH, DataError, Episode, Frame, make_episode
+from data_pipelines.records import Episode, make_episode
 from dsvla_jax.encoding.keypoints import replay_latch
-from dsvla_jax.geometry.cameras import project
-from dsvla_jax.types import Camera
-
-# How far a rotation matrix may be from orthonormal and a quaternion from unit length.
-ROTATION_TOLERANCE = 1e-3
-QUATERNION_TOLERANCE = 1e-2
-# Metres: no arm or camera of a table-top scene is farther from the origin, so larger numbers are other units.
-MAX_COORDINATE = 20.0
-# Metres: how far from everything seen in their directions all keypoints of objects may be.
-SURFACE_TOLERANCE = 0.1
-# Metres: a depth map whose middle value is above this is in other units.
-MAX_MIDDLE_DEPTH = 20.0
+from dsvla_jax.errors import DataError
+from dsvla_jax.observation_checks import check_camera, check_keypoints, check_pictures, check_poses
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,132 +133,6 @@ def check_recording(recording: Recording, where: object) -> None:
         shape = np.shape(recording.keypoints)
         if len(shape) != 3 or shape[0] != arms or shape[1] == 0 or shape[2] != 3:
             raise DataError(where, "keypoints", f"({arms}, K, 3) with K >= 1", str(shape), "or None where not known")
-
-
-def check_poses(pose: np.ndarray, where: object) -> None:
-    """Raises DataError unless every pose (T, A, 7) is finite, in metres, and has a unit quaternion."""
-    finite = np.isfinite(pose).all(axis=(1, 2))
-    if not finite.all():
-        place = f"{where}, observation {int(np.argmin(finite))}"
-        fix = "leave out observations without a pose, or the whole recording"
-        raise DataError(place, "pose", "finite numbers", f"{pose[np.argmin(finite)].tolist()}", fix)
-    far = np.abs(pose[..., :3]).max(axis=(1, 2))
-    if far.max() > MAX_COORDINATE:
-        place = f"{where}, observation {int(np.argmax(far))}"
-        raise DataError(
-            place, "pose", "metres from the world's origin", f"{far.max():.4g}", "divide millimetres by 1000"
-        )
-    length = np.linalg.norm(pose[..., 3:], axis=-1)
-    error = np.abs(length - 1).max(axis=1)
-    if error.max() > QUATERNION_TOLERANCE:
-        worst = int(np.argmax(error))
-        fix = "give qx qy qz qw, not Euler angles or an axis times an angle"
-        raise DataError(
-            f"{where}, observation {worst}", "pose", "a unit quaternion", f"length {length[worst].tolist()}", fix
-        )
-
-
-def check_pictures(rgb: np.ndarray, depth: np.ndarray, where: object) -> None:
-    """Raises DataError unless one observation's picture and depth map are what they have to be."""
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[-1] != 3:
-        fix = "give whole numbers from 0 to 255 and three channels" + (
-            "; multiply numbers from 0 to 1 by 255 first" if rgb.dtype.kind == "f" else ""
-        )
-        raise DataError(where, "rgb", "uint8 (H, W, 3)", f"{rgb.dtype} {rgb.shape}", fix)
-    if depth.shape != rgb.shape[:2]:
-        fix = "register depth to the colour camera: both must be seen by one camera at one size"
-        raise DataError(where, "depth", f"{rgb.shape[:2]} as of rgb", str(depth.shape), fix)
-    if depth.dtype.kind != "f":
-        fix = "divide by 1000 if these are millimetres, and give floating point"
-        raise DataError(where, "depth", "metres as floating point", f"{depth.dtype} up to {depth.max()}", fix)
-    if count := int(np.sum(~np.isfinite(depth))):
-        raise DataError(where, "depth", "finite values", f"{count} non-finite pixels", "write 0 for a missing reading")
-    readings = depth[depth != 0]
-    if not len(readings):
-        raise DataError(where, "depth", "some readings", "0 everywhere", "check that the depth stream was on")
-    if np.median(readings) > MAX_MIDDLE_DEPTH:
-        fix = "divide by 1000 if these are millimetres"
-        raise DataError(where, "depth", "metres", f"a median of {np.median(readings):.4g}", fix)
-    if depth.min() < 0 or depth.max() > MAX_DEPTH:
-        span = f"{depth.min():.4g} to {depth.max():.4g}"
-        raise DataError(where, "depth", f"0 to {MAX_DEPTH:g} m", span, "write 0 for what is out of the camera's range")
-
-
-def check_camera(intrinsics: np.ndarray, world_from_camera: np.ndarray, size: tuple[int, ...], where: object) -> None:
-    """Raises DataError unless (3, 3) and (4, 4) calibrate pictures of size (height, width)."""
-    if not (np.isfinite(intrinsics).all() and np.isfinite(world_from_camera).all()):
-        raise DataError(where, "camera", "finite numbers", "non-finite ones", "calibrate the camera")
-    height, width = size
-    row = intrinsics[2].tolist()
-    if row != [0, 0, 1] or intrinsics[0, 0] == 0 or intrinsics[1, 1] == 0 or intrinsics[1, 0] != 0:
-        fix = "give [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-        raise DataError(where, "intrinsics", "a pinhole camera's matrix", str(intrinsics.tolist()), fix)
-    u, v = intrinsics[0, 2], intrinsics[1, 2]
-    # A whole sensor's optical axis is near the middle of its picture; that of a crop need not be.
-    if not (0 <= u < width and 0 <= v < height):
-        fix = "scale the intrinsics with the picture: they are of another size"
-        raise DataError(where, "intrinsics", f"a centre in {width} x {height} pixels", f"({u:.1f}, {v:.1f})", fix)
-    rotation = world_from_camera[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > ROTATION_TOLERANCE:
-        fix = "columns must be of unit length and at right angles"
-        raise DataError(where, "world_from_camera", "a rotation", f"one off by {error:.2g}", fix)
-    if np.linalg.det(rotation) < 0:
-        fix = "one axis has the wrong sign, or x and y are exchanged"
-        raise DataError(where, "world_from_camera", "a rotation", "a mirror image", fix)
-    if world_from_camera[3].tolist() != [0, 0, 0, 1]:
-        fix = "give [[R, t], [0, 0, 0, 1]]; a transposed matrix has t in its last row"
-        raise DataError(where, "world_from_camera", "a last row 0 0 0 1", str(world_from_camera[3].tolist()), fix)
-    if np.abs(world_from_camera[:3, 3]).max() > MAX_COORDINATE:
-        got = f"{world_from_camera[:3, 3].tolist()}"
-        raise DataError(where, "world_from_camera", "a place in metres", got, "divide millimetres by 1000")
-
-
-def check_keypoints(
-    keypoints: np.ndarray,
-    intrinsics: np.ndarray,
-    world_from_camera: np.ndarray,
-    size: tuple[int, ...],
-    where: object,
-) -> None:
-    """Raises DataError where keypoints (A, K, 3) are not finite, one is behind the camera, or all are out of view.
-
-    intrinsics (3, 3), world_from_camera (4, 4), size (height, width): of the first picture.
-    """
-    if not np.isfinite(keypoints).all():
-        raise DataError(where, "keypoints", "finite numbers", "non-finite ones", "or None where not known")
-    if not keypoints.size:
-        return
-    camera = Camera(jnp.asarray(intrinsics, jnp.float32), jnp.asarray(world_from_camera, jnp.float32))
-    pixels, depth = map(np.asarray, project(np.asarray(keypoints, np.float32), camera))
-    fix = "give metres in the world frame, and world_from_camera, not its inverse"
-    if depth.min() <= 0:
-        arm, place = np.unravel_index(int(np.argmin(depth)), depth.shape)
-        got = f"{keypoints[arm, place].tolist()}, {float(depth[arm, place]):.3f} m along the viewing direction"
-        raise DataError(where, f"keypoints[{arm}, {place}]", "a point before the camera", got, fix)
-    if not np.any(np.all((pixels >= 0) & (pixels < [size[1], size[0]]), axis=-1)):
-        got = f"pixels {np.rint(pixels).astype(int).tolist()}"
-        raise DataError(where, "keypoints", f"one in the first {size[1]} x {size[0]} picture", got, fix)
-
-
-def check_surface(frame: Frame, keypoints: np.ndarray, where: object) -> None:
-    """Raises DataError unless a keypoint (A, K, 3) of objects is near what the camera sees where it projects to.
-
-    Catches a calibration, a unit or a frame that is wrong though each number looks right. Passes where no keypoint is
-    on a pixel with a reading, and where any is within `SURFACE_TOLERANCE`: others may be hidden or in the air.
-    """
-    camera = Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
-    pixels, distance = map(np.asarray, project(np.asarray(keypoints, np.float32).reshape(-1, 3), camera))
-    errors = []
-    for (u, v), expected in zip(np.rint(pixels).astype(int), distance, strict=True):
-        # A keypoint is a little inside its object, and seen edges are ragged: the nearest reading around it counts.
-        window = frame["depth"][max(v - 2, 0) : max(v + 3, 0), max(u - 2, 0) : max(u + 3, 0)]
-        if (window > 0).any():
-            errors.append(np.abs(window[window > 0] - expected).min())
-    if errors and min(errors) > SURFACE_TOLERANCE:
-        got = f"{min(errors):.2f} m between the nearest of them and what is seen in its direction"
-        fix = "check world_from_camera (or is it the inverse?), intrinsics, and the frame of the keypoints"
-        raise DataError(where, "keypoints", "points on things that the camera sees", got, fix)
 
 
 def _per_observation(matrix: np.ndarray, count: int) -> np.ndarray:

@@ -17,21 +17,14 @@ import msgpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dsvla_jax.errors import UserError
+from dsvla_jax.errors import DataError
+from dsvla_jax.observation_checks import MAX_DEPTH
 
 RECORD_VERSION = 1
 DEPTH_UNIT = 1e-4
-MAX_DEPTH = 65535 * DEPTH_UNIT
 
 _DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1", "|b1")
 _PICTURES = ("rgb_png", "depth_png")
-
-
-class DataError(UserError):
-    """Recorded data that must not be used: says which file and field, what was expected, and what to do about it."""
-
-    def __init__(self, where: object, field: str, expected: str, got: str, fix: str):
-        super().__init__(f"{where}: {field}: expected {expected}, got {got}; {fix}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,9 +6,8 @@ from typing import Any
 
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
-from data_pipelines.vocabulary import check_words
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.encoding.text import Tokenizer, check_words
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.tasks import select_tasks
 

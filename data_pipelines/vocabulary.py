@@ -12,8 +12,7 @@ import tyro
 
 from data_pipelines.episodes import EpisodeReader
 from dsvla_jax.command_line import fail_with_message
-from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, split_words, vocabulary
-from dsvla_jax.errors import UserError
+from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.sim.tasks import TASKS
 
 
@@ -35,19 +34,6 @@ def write_vocabulary(out: Path, texts: Iterable[str]) -> None:
     tokenizer.save(out)
     print(f"{out / 'tokenizer.json'}: {tokenizer.vocab_size} tokens; train with")
     print(f"  --tokenizer {out} --model.language.vocab-size {tokenizer.vocab_size}")
-
-
-def check_words(where: object, texts: Iterable[str], tokenizer: Tokenizer, command: str) -> None:
-    """Raises UserError where a word of a text would become <unk>. command: what writes a vocabulary that has it."""
-    if not isinstance(tokenizer, WordTokenizer):
-        return
-    words = {word for text in texts for word in split_words(text) if not word.lstrip("-").isdigit()}
-    if unknown := sorted(words - set(tokenizer.words)):
-        some = ", ".join(map(repr, unknown[:5])) + (f" and {len(unknown) - 5} more" if len(unknown) > 5 else "")
-        raise UserError(
-            f"{where}: the vocabulary has no token for {some}; write one with `{command}`, and train with the options"
-            " that it prints"
-        )
 
 
 if __name__ == "__main__":

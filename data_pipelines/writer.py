@@ -9,9 +9,11 @@ import numpy as np
 
 from data_pipelines.episodes import INDEX_FILE, read_index, shard_name, write_index, write_shard
 from data_pipelines.keyframes import discover_keyframes, sample_starts
-from data_pipelines.recording import Recording, check_recording, check_surface, make_demonstration
-from data_pipelines.records import DataError, Episode, decode_frame
+from data_pipelines.recording import Recording, check_recording, make_demonstration
+from data_pipelines.records import Episode, decode_frame
 from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.errors import DataError
+from dsvla_jax.observation_checks import check_surface
 
 EPISODES_PER_SHARD = 20
 
@@ -74,7 +76,8 @@ class DemonstrationWriter:
             raise DataError(where, "keyframes", f"ascending numbers from 1 to {count - 1}", str(numbers)[:80], fix)
         episode = make_demonstration(recording, sample_starts(numbers, self.every_n), number, where)
         self._check_box(episode, where)
-        check_surface(decode_frame(episode, 0), episode.keypoints, where)
+        first = decode_frame(episode, 0)
+        check_surface(first["depth"], first["intrinsics"], first["world_from_camera"], episode.keypoints, where)
         self._counts[recording.task] = number + 1
         self._waiting.setdefault(recording.task, []).append(episode)
         if len(self._waiting[recording.task]) == EPISODES_PER_SHARD:

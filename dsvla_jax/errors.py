@@ -1,5 +1,12 @@
-"""The one exception that the programs turn into a message instead of a traceback."""
+"""The exceptions that the programs turn into a message instead of a traceback."""
 
 
 class UserError(ValueError):
     """The input is at fault, not the code: the message names what was wrong, what was expected, and the fix."""
+
+
+class DataError(UserError):
+    """Recorded data that must not be used: says which file and field, what was expected, and what to do about it."""
+
+    def __init__(self, where: object, field: str, expected: str, got: str, fix: str):
+        super().__init__(f"{where}: {field}: expected {expected}, got {got}; {fix}")

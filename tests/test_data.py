@@ -15,7 +15,6 @@ from data_pipelines.demos import ScriptedExpert, Settings, generate_demonstratio
 from data_pipelines.episodes import EpisodeReader, write_episodes
 from data_pipelines.loader import make_loader
 from data_pipelines.records import (
-    DataError,
     decode_depth,
     decode_frame,
     decode_rgb,
@@ -27,6 +26,7 @@ from data_pipelines.records import (
     unpack_episode,
 )
 from dsvla_jax.encoding.keypoints import replay_latch
+from dsvla_jax.errors import DataError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action, Camera

@@ -13,7 +13,7 @@ from data_pipelines.episodes import write_episodes
 from data_pipelines.inspect.__main__ import Options, describe, main
 from data_pipelines.inspect.page import print_page
 from data_pipelines.recording import Recording, make_demonstration
-from data_pipelines.records import DataError
+from dsvla_jax.errors import DataError
 from tests import rlbench_files as files
 
 BOX_TOP = np.array([0.25, 0.0, 0.9])

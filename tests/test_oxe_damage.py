@@ -14,12 +14,12 @@ from data_pipelines.oxe.index import check_pictures, load_index
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.oxe.registry import get_dataset
 from data_pipelines.oxe.targets import make_targets
-from data_pipelines.records import DataError
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.tfrecord import write_records
 from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.errors import DataError
 
 EPISODES, STEPS = 6, 6  # in two shards
 ENCODING = EncodingConfig(image_size=32, patch_size=16, style="compact", max_text_length=64, use_points=False)

@@ -10,7 +10,7 @@ import pytest
 from data_pipelines.oxe.fixtures import known_episodes
 from data_pipelines.oxe.mixture import MixtureSource, OpenDataset
 from data_pipelines.oxe.order import BlockOrder, deal, schedule
-from data_pipelines.records import DataError
+from dsvla_jax.errors import DataError
 from tests.oxe_mixtures import FIVE, config_for, make, names_of, write_datasets
 
 

@@ -11,12 +11,11 @@ from data_pipelines.oxe.fixture_build import episode_of, features_of
 from data_pipelines.oxe.fixture_motion import known_episode
 from data_pipelines.oxe.fixtures import FIXTURES, write_fixture, write_fixtures
 from data_pipelines.oxe.registry import DATASETS, MIXTURES, get_dataset, get_mixture
-from data_pipelines.records import DataError
 from data_pipelines.rlds import writing
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.features import decode_image, image_format
 from data_pipelines.rlds.writing import write_build
-from dsvla_jax.errors import UserError
+from dsvla_jax.errors import DataError, UserError
 
 # What the published data tell, by hand.
 NO_POSE = {

@@ -8,9 +8,10 @@ import pytest
 
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.recording import Recording
-from data_pipelines.records import DataError, decode_frame
+from data_pipelines.records import decode_frame
 from data_pipelines.writer import DemonstrationWriter
 from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.errors import DataError
 
 STEPS, SIZE = 12, 16
 SIDE = np.array([[-1, 0, 0, 0.2], [0, -0.6, -0.8, 0.9], [0, -0.8, 0.6, 0.2], [0, 0, 0, 1]])

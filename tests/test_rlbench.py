@@ -10,10 +10,11 @@ import pytest
 
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.keyframes import discover_keyframes, sample_starts
-from data_pipelines.records import DataError, decode_frame
+from data_pipelines.records import decode_frame
 from data_pipelines.rlbench.__main__ import Options, Settings, contact_keypoints, import_demonstrations, main
 from data_pipelines.rlbench.files import find_episodes, read_recording, unpack_depth
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
+from dsvla_jax.errors import DataError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.types import Camera
 from tests import rlbench_files as files

@@ -7,9 +7,9 @@ import subprocess
 import numpy as np
 import pytest
 
-from data_pipelines.records import DataError
 from data_pipelines.rlbench.files import read_recording
 from data_pipelines.rlbench.unpickle import read_pickle, to_array
+from dsvla_jax.errors import DataError
 from tests import rlbench_files as files
 
 

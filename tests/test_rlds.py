@@ -9,10 +9,10 @@ import pytest
 from etils import epath
 from tensorflow_datasets.core import features as tfds_features
 
-from data_pipelines.records import DataError
 from data_pipelines.rlds.build import FORMATS, Format, RldsBuild
 from data_pipelines.rlds.tfrecord import masked_crc
 from data_pipelines.rlds.writing import encode_image, write_build
+from dsvla_jax.errors import DataError
 
 Tensor = tfds_features.Tensor
 STEPS = (3, 0, 2, 4)  # of the four episodes

@@ -14,11 +14,11 @@ import tyro
 from data_pipelines.episodes import INDEX_FILE
 from data_pipelines.inspect.episodes import describe_episodes
 from data_pipelines.inspect.page import Page, print_page, write_page
-from data_pipelines.records import DataError
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.prompts import Style
+from dsvla_jax.errors import DataError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,14 +21,14 @@ from data_pipelines.oxe.registry import DATASETS, get_dataset
 from data_pipelines.oxe.samples import prompts_and_answers, write_picture
 from data_pipelines.oxe.scale import HIGH, LOW, MixtureScale
 from data_pipelines.oxe.targets import why_unsupported
-from data_pipelines.records import DataError, Frame
+from data_pipelines.records import Frame
 from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.displacement import displace
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
-from dsvla_jax.errors import UserError
+from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.report import MAX_STRIP_FRAMES, film_strip
 
 _VERSION = re.compile(r"\d+\.\d+\.\d+")

@@ -13,11 +13,11 @@ from data_pipelines.inspect.page import Page, Section, Table
 from data_pipelines.oxe.dataset import OxeDataset
 from data_pipelines.oxe.index import main_view
 from data_pipelines.oxe.motion import Motion
-from data_pipelines.records import DataError
 from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.features import RldsEpisode, image_format, is_number, is_text
 from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.errors import DataError
 from dsvla_jax.report import MAX_STRIP_FRAMES, film_strip
 
 LOOKED_AT = 50

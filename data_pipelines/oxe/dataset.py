@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from data_pipelines.oxe.motion import Arm, Column, Motion, require_finite
-from data_pipelines.records import DataError
 from data_pipelines.rlds.features import RldsEpisode
+from dsvla_jax.errors import DataError
 
 Encoding = Literal["end_effector", "joints", "navigation"]
 View = Literal["primary", "secondary", "wrist"]

@@ -21,12 +21,12 @@ from data_pipelines.oxe import motion as motion_module
 from data_pipelines.oxe import registry, targets
 from data_pipelines.oxe.dataset import OxeDataset
 from data_pipelines.oxe.targets import make_targets
-from data_pipelines.records import DataError
 from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild, Shard, TFRecordFile
 from dsvla_jax.command_line import cache_folder
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.text import split_words
+from dsvla_jax.errors import DataError
 
 VERSION = 2
 KEPT_FRAMES = 1 << 18

@@ -14,13 +14,11 @@ from data_pipelines.loader import Sample
 from data_pipelines.oxe.mixture import ENDLESS, EncodedSample, MixtureSource
 from data_pipelines.oxe.samples import make_batcher
 from data_pipelines.oxe.scale import MixtureScale
-from data_pipelines.records import DataError
-from data_pipelines.vocabulary import check_words
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.encode import EncodingConfig
-from dsvla_jax.encoding.text import Tokenizer
-from dsvla_jax.errors import UserError
+from dsvla_jax.encoding.text import Tokenizer, check_words
+from dsvla_jax.errors import DataError, UserError
 
 
 class OxeLoader(Iterator[Sample]):

@@ -14,8 +14,8 @@ from typing import Literal, NoReturn
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_pipelines.records import DataError
 from data_pipelines.rlds.features import RldsEpisode
+from dsvla_jax.errors import DataError
 
 RotationKind = Literal["rpy", "ypr", "zxy", "xyzw", "wxyz", "rotvec", "matrix", "yaw", "none"]
 Column = Callable[[RldsEpisode], np.ndarray]

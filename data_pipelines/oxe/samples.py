@@ -11,7 +11,6 @@ import numpy as np
 from data_pipelines.oxe.mixture import EncodedSample
 from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
-from data_pipelines.records import DataError
 from data_pipelines.rlds.features import decode_image
 from data_pipelines.samples import Sample
 from dsvla_jax.data_config import OxeConfig
@@ -19,6 +18,7 @@ from dsvla_jax.encoding.encode import EncodingConfig, encode_text
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.errors import DataError
 
 
 def make_batcher(

@@ -16,10 +16,11 @@ from tqdm import tqdm
 from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
 from data_pipelines.keyframes import discover_keyframes, sample_starts
 from data_pipelines.recording import make_demonstration
-from data_pipelines.records import DataError, Episode
+from data_pipelines.records import Episode
 from data_pipelines.rlbench.files import find_episodes, read_recording
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.digests import file_digest
+from dsvla_jax.errors import DataError
 
 EPISODES_PER_SHARD = 20
 

@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 
 from data_pipelines.recording import Recording
-from data_pipelines.records import DataError, mark_missing
+from data_pipelines.records import mark_missing
 from data_pipelines.rlbench.unpickle import Node, read_pickle, to_array
+from dsvla_jax.errors import DataError
 
 _FIX = "copy or unpack the data set again, or leave such episodes out with --skip-bad"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.records import DataError
+from dsvla_jax.errors import DataError
 
 _RLBENCH = {
     ("rlbench.demo", "Demo"),

@@ -12,10 +12,10 @@ from typing import Any, BinaryIO, Literal, Protocol
 
 import numpy as np
 
-from data_pipelines.records import DataError
 from data_pipelines.rlds import files
 from data_pipelines.rlds.features import RldsEpisode, parse_features
 from data_pipelines.rlds.tfrecord import read_record, record_offsets
+from dsvla_jax.errors import DataError
 
 Format = Literal["tfrecord", "array_record", "parquet"]
 FORMATS: tuple[Format, ...] = ("tfrecord", "array_record", "parquet")

@@ -24,7 +24,7 @@ from tensorflow_datasets.core.features import (
 from tensorflow_datasets.core.features.tensor_feature import Encoding
 from tensorflow_datasets.proto import tf_example_pb2
 
-from data_pipelines.records import DataError
+from dsvla_jax.errors import DataError
 
 STEPS = "steps"
 # Bytes within which a picture's end marker has to be: some writers pad.

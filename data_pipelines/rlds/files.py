@@ -6,7 +6,7 @@ from typing import Any, BinaryIO
 
 import fsspec
 
-from data_pipelines.records import DataError
+from dsvla_jax.errors import DataError
 
 
 def is_remote(path: str) -> bool:

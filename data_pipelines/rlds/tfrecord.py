@@ -12,7 +12,7 @@ from typing import BinaryIO
 import google_crc32c
 import numpy as np
 
-from data_pipelines.records import DataError
+from dsvla_jax.errors import DataError
 
 HEADER_BYTES, FOOTER_BYTES = 12, 4
 _MASK_DELTA = 0xA282EAD8

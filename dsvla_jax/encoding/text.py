@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from dsvla_jax.encoding.prompts import template_texts
+from dsvla_jax.errors import UserError
 
 LOWEST_NUMBER, HIGHEST_NUMBER = -100, 200
 _SPECIAL = ("<pad>", "<unk>", "<s>", "</s>")
@@ -147,6 +148,24 @@ class WordTokenizer:
                 f"number {word} has no token: integers from {LOWEST_NUMBER} to {HIGHEST_NUMBER} have one; in {text!r}"
             )
         return self._ids[number]
+
+
+def unknown_words(texts: Iterable[str], tokenizer: Tokenizer) -> list[str]:
+    """The words of the texts that would become <unk>, sorted; a subword tokenizer knows every word."""
+    if not isinstance(tokenizer, WordTokenizer):
+        return []
+    words = {word for text in texts for word in split_words(text) if not word.lstrip("-").isdigit()}
+    return sorted(words - set(tokenizer.words))
+
+
+def check_words(where: object, texts: Iterable[str], tokenizer: Tokenizer, command: str) -> None:
+    """Raises UserError if a word of a text would become <unk>. command: what writes a vocabulary that has it."""
+    if unknown := unknown_words(texts, tokenizer):
+        some = ", ".join(map(repr, unknown[:5])) + (f" and {len(unknown) - 5} more" if len(unknown) > 5 else "")
+        raise UserError(
+            f"{where}: the vocabulary has no token for {some}; write one with `{command}`, and train with the options"
+            " that it prints"
+        )
 
 
 def _is_number(word: str) -> bool:
