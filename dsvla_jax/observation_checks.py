@@ -19,6 +19,9 @@ MAX_COORDINATE = 20.0
 SURFACE_TOLERANCE = 0.1
 # Metres: a depth map whose middle value is above this is in other units.
 MAX_MIDDLE_DEPTH = 20.0
+# Of all readings, the least share that must lie in the workspace: fewer, and the camera, the units or the workspace are
+# those of another set-up.
+MIN_WORKSPACE_SHARE = 0.01
 # Metres: the largest reading that 16 bits of 0.1 mm hold, as depth is stored.
 MAX_DEPTH = 6.5535
 
@@ -149,3 +152,37 @@ def check_surface(
         got = f"{min(errors):.2f} m between the nearest of them and what is seen in its direction"
         fix = "check world_from_camera (or is it the inverse?), intrinsics, and the frame of the keypoints"
         raise DataError(where, "keypoints", "points on things that the camera sees", got, fix)
+
+
+def points_in_workspace(
+    depth: np.ndarray,
+    intrinsics: np.ndarray,
+    world_from_camera: np.ndarray,
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+) -> tuple[int, int]:
+    """How many points of a depth map (H, W) lie in the box from ``low`` to ``high``, and how many readings it has.
+
+    low, high: metres, world frame. A pixel has a reading where its depth is finite and positive.
+    """
+    depth = np.asarray(depth, np.float64)
+    rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
+    pixels = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
+    rays = pixels @ np.linalg.inv(np.asarray(intrinsics, np.float64)).T
+    pose = np.asarray(world_from_camera, np.float64)
+    points = rays * depth[rows, columns][:, None] @ pose[:3, :3].T + pose[:3, 3]
+    return int(np.all((points >= low) & (points <= high), axis=-1).sum()), len(rows)
+
+
+def check_workspace(
+    inside: int, readings: int, low: tuple[float, float, float], high: tuple[float, float, float], where: object
+) -> None:
+    """Raises DataError unless at least `MIN_WORKSPACE_SHARE` of the readings lie in the workspace.
+
+    inside, readings: as `points_in_workspace` counts them, of one picture or summed over several.
+    """
+    if inside < max(MIN_WORKSPACE_SHARE * readings, 1):
+        fix = "check world_from_camera, intrinsics and the unit of depth, or set the workspace to the data's"
+        got = f"{inside} of {readings} readings"
+        expected = f"at least {MIN_WORKSPACE_SHARE:.0%} of the readings in the workspace from {low} to {high}"
+        raise DataError(where, "depth", expected, got, fix)
