@@ -23,7 +23,6 @@ import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.perception.keypoints import Sighting, draw_sightings, locate
-from dsvla_jax.perception.phrases import phrases_for
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.objects import object_geoms, object_masks
 from dsvla_jax.sim.physics import SimState
@@ -89,9 +88,10 @@ def measure(name: str, options: Options) -> tuple[list[float], int, list[float]]
     masks, seen = object_masks(environment, state), environment.observe(state)
     own = np.asarray(environment.keypoints(state))
     errors, solids, to_own = [], 0, []
-    for i, instruction in enumerate(environment.instructions(state)):
+    for i in range(options.episodes):
         one: Any = jax.tree.map(lambda x, i=i: np.asarray(x)[i], state)
-        phrases, depth = phrases_for(instruction)[0], np.asarray(seen.depth)[i]
+        task = environment.task
+        phrases, depth = task.phrases(task.words(int(one.variation)))[0], np.asarray(seen.depth)[i]
         sightings = [
             locate(Sighting(phrase, mask), depth, one.camera) for phrase, mask in zip(phrases, masks[i], strict=True)
         ]

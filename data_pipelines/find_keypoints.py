@@ -22,6 +22,7 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.perception.grounding import GroundingOptions
 from dsvla_jax.perception.keypoints import KeypointsNotFound, Segmenter, Sighting, draw_sightings, find_keypoints
 from dsvla_jax.perception.phrases import ObjectPhrases, phrases_for
+from dsvla_jax.rollout_keypoints import suite_phrases
 from dsvla_jax.types import Camera
 
 
@@ -67,7 +68,7 @@ def _active(poses: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
 def main(options: Options) -> None:
     if options.out.exists():
         raise UserError(f"{options.out}: exists already; choose another folder")
-    reader, table = EpisodeReader(options.demos), options.grounding.table()
+    reader, table = EpisodeReader(options.demos), (*options.grounding.table(), *suite_phrases())
     segment = options.grounding.segmenter()
     problems: list[str] = []
 

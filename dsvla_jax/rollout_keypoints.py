@@ -11,13 +11,21 @@ import jax
 import numpy as np
 
 from dsvla_jax.perception.keypoints import KeypointsNotFound, KeypointTracker, Sighting
-from dsvla_jax.perception.phrases import phrases_for
+from dsvla_jax.perception.phrases import ObjectPhrases
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.objects import object_masks
 from dsvla_jax.sim.physics import SimState
+from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.types import Observation
 
 Keypoints = Literal["oracle", "segmentation", "segmentation-refresh"]
+
+
+def suite_phrases() -> tuple[ObjectPhrases, ...]:
+    """How to recognise the task suite's instructions, and the phrases of the objects that they name."""
+    return tuple(
+        ObjectPhrases(task.name, task.recognised_by, task.phrases({})) for task in TASKS.values() if task.recognised_by
+    )
 
 
 def keypoint_source(kind: Keypoints, environment: Environment) -> "Callable[[SimState], SegmentationKeypoints] | None":
@@ -36,12 +44,13 @@ class SegmentationKeypoints:
     seen on them, through the geometry that a robot's pictures go through.
 
     state: the reset state of the B episodes. refresh: looks again before every key pose, see `KeypointTracker`;
-    otherwise the first frame's keypoints are kept. Raises UserError for a task whose instructions have no phrases.
+    otherwise the first frame's keypoints are kept. Raises UserError for a task that names no objects.
     """
 
     def __init__(self, environment: Environment, state: SimState, refresh: bool = False):
         self._environment = environment
-        self._arms = [phrases_for(instruction) for instruction in environment.instructions(state)]
+        task = environment.task
+        self._arms = [task.phrases(task.words(variation)) for variation in np.asarray(state.variation).tolist()]
         self._trackers = [KeypointTracker(functools.partial(self._segment, i), refresh) for i in range(len(self._arms))]
         self._refresh, self._masks = refresh, np.zeros(0, bool)
 

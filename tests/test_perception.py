@@ -21,9 +21,10 @@ from dsvla_jax.perception.keypoints import (
     keypoint_pixel,
     locate,
 )
-from dsvla_jax.perception.phrases import TABLE, ObjectPhrases, load_table, phrases_for
+from dsvla_jax.perception.phrases import ObjectPhrases, load_table, phrases_for
+from dsvla_jax.rollout_keypoints import suite_phrases
 from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.objects import OBJECT_GEOMS, object_geoms, object_masks
+from dsvla_jax.sim.objects import object_geoms, object_masks
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import TASKS
 
@@ -50,26 +51,23 @@ def segmenter_of(masks: dict[str, np.ndarray]):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_every_instruction_of_the_suite_has_the_phrases_of_its_task(name):
-    (row,) = [row for row in TABLE if row.task == name]
-    for variation in range(TASKS[name].variations):
-        for way in range(len(TASKS[name].instructions)):
-            colour = TASKS[name].words(variation).get("colour", "")
-            expected = tuple(tuple(p.replace("{colour}", colour) for p in arm) for arm in row.arms)
-            assert phrases_for(TASKS[name].say(variation, way)) == expected
-    assert phrases_for(name) == tuple(tuple(p.replace("{colour} ", "") for p in arm) for arm in row.arms)
-    assert len(row.arms) == TASKS[name].num_arms
-    assert len(row.arms[0]) == len(OBJECT_GEOMS[name])
+    task, table = TASKS[name], suite_phrases()
+    for variation in range(task.variations):
+        for way in range(len(task.instructions)):
+            assert phrases_for(task.say(variation, way), table) == task.phrases(task.words(variation))
+    without_colour = task.phrases({"colour": ""})
+    assert phrases_for(name, table) == tuple(tuple(phrase.strip() for phrase in arm) for arm in without_colour)
 
 
 def test_phrases_of_other_instructions_come_from_a_file(tmp_path):
     with pytest.raises(UserError, match=r"no object phrases for the instruction 'fold the shirt'.*perception\.md"):
-        phrases_for("fold the shirt")
+        phrases_for("fold the shirt", suite_phrases())
     file = tmp_path / "phrases.json"
     file.write_text(json.dumps({r"\bshirt\b": ["left sleeve", "right sleeve"], "cup": [["cup"], ["saucer"]]}))
-    table = load_table(file)
+    table = (*load_table(file), *suite_phrases())
     assert phrases_for("Fold the shirt", table) == (("left sleeve", "right sleeve"),)
     assert phrases_for("lift the cup", table) == (("cup",), ("saucer",))
-    assert phrases_for("turn on the light", table) == phrases_for("turn on the light")
+    assert phrases_for("turn on the light", table) == TASKS["lamp_on"].phrases({})
     for wrong in ("[]", "{", '{"(": ["x"]}', '{"x": []}', '{"x": "y"}', '{"x": [[]]}'):
         file.write_text(wrong)
         with pytest.raises(UserError, match=r"phrases\.json: expected a JSON object"):

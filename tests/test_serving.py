@@ -18,6 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.geometry.cameras import front_camera, unproject
 from dsvla_jax.perception.keypoints import Sighting
+from dsvla_jax.rollout_keypoints import suite_phrases
 from dsvla_jax.serving.batching import answer_batch
 from dsvla_jax.serving.client import PolicyClient, ServerError
 from dsvla_jax.serving.messages import MAX_CONTAINERS, MessageError, pack, unpack
@@ -257,8 +258,9 @@ def test_keypoints_are_found_in_the_picture_of_a_robot_that_sends_none(policy):
     dark = {**request, "rgb": np.zeros((SIZE, SIZE, 3), np.uint8), "depth": np.full((SIZE, SIZE), 1.0)}
     lit = {**dark, "rgb": dark["rgb"].copy()}
     lit["rgb"][20:25, 8:13] = 255
+    looking = Perception(bright, suite_phrases())
     with (
-        running(lambda: small_server(policy, limits={"batch": 1}, perception=Perception(bright))) as (_, port),
+        running(lambda: small_server(policy, limits={"batch": 1}, perception=looking)) as (_, port),
         PolicyClient(port=port) as client,
     ):
         assert client.metadata["needs_keypoints"] is False

@@ -12,7 +12,7 @@ import numpy as np
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import ONE_END, OTHER_END, Sighting
-from dsvla_jax.perception.phrases import TABLE, ObjectPhrases, load_table
+from dsvla_jax.perception.phrases import ObjectPhrases, load_table
 
 DETECTOR = "IDEA-Research/grounding-dino-tiny"
 SEGMENTER = "facebook/sam-vit-huge"
@@ -38,8 +38,8 @@ class GroundingOptions:
         return GroundedSegmenter.from_pretrained(self.detector, self.mask_model, self.box_threshold, self.device)
 
     def table(self) -> Sequence[ObjectPhrases]:
-        """Which phrases an instruction stands for. Raises UserError."""
-        return TABLE if self.phrases is None else load_table(self.phrases)
+        """The rows of the file `phrases`, none without one. Raises UserError."""
+        return () if self.phrases is None else load_table(self.phrases)
 
 
 class GroundedSegmenter:

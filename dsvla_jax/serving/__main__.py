@@ -17,6 +17,7 @@ from dsvla_jax import policy as policies
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
 from dsvla_jax.perception.grounding import GroundingOptions
+from dsvla_jax.rollout_keypoints import suite_phrases
 from dsvla_jax.serving.server import Limits, Perception, PolicyServer
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.training.experiment import load_experiment
@@ -61,7 +62,8 @@ def build_server(options: Options) -> PolicyServer:
     perception = None
     if options.perception != "off":
         grounding = options.grounding
-        perception = Perception(grounding.segmenter(), options.perception == "refresh", grounding.table())
+        phrases = (*grounding.table(), *suite_phrases())
+        perception = Perception(grounding.segmenter(), phrases, options.perception == "refresh")
     policy = policies.load(options.run)
     return PolicyServer(policy, sizes, arms, options.limits, token, options.run.name, perception)
 

@@ -24,7 +24,7 @@ from websockets.http11 import Response
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import KeypointTracker, Segmenter
-from dsvla_jax.perception.phrases import TABLE, ObjectPhrases, phrases_for
+from dsvla_jax.perception.phrases import ObjectPhrases, phrases_for
 from dsvla_jax.policy import Policy
 from dsvla_jax.serving.batching import (
     Answer,
@@ -68,12 +68,12 @@ class Limits:
 class Perception:
     """How keypoints are found for robots that send none.
 
-    refresh: at every request, not only at the first of an episode. phrases: what objects an instruction names.
+    phrases: what objects an instruction names. refresh: at every request, not only at the first of an episode.
     """
 
     segment: Segmenter
+    phrases: Sequence[ObjectPhrases]
     refresh: bool = False
-    phrases: Sequence[ObjectPhrases] = TABLE
 
 
 class PolicyServer:

@@ -4,52 +4,38 @@ import re
 
 import numpy as np
 
+from dsvla_jax.errors import UserError
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
-
-# For each task the geoms of its objects, in the order of the instruction, as regular expressions of whole names.
-# {colour} is the variation's. Of several blocks of one colour, one.
-OBJECT_GEOMS: dict[str, tuple[str, ...]] = {
-    "beat_the_buzz": ("wand_handle",),
-    "bimanual_lift_ball": ("ball",),
-    "bimanual_lift_tray": ("tray.*",),
-    "bimanual_pick_laptop": ("laptop(?!_holder).*",),
-    "bimanual_push_box": ("box.*", "target"),
-    "bimanual_straighten_rope": (r"rope_(tail|head|\d+)", "rope_.*_target"),
-    "change_clock": ("clock_knob",),
-    "close_box": ("box_.*",),
-    "close_fridge": ("fridge_.*",),
-    "close_laptop_lid": ("laptop_(?!stand).*",),
-    "lamp_on": ("lamp_button",),
-    "open_microwave": ("microwave_handle.*",),
-    "phone_on_base": ("phone_(handle|ear.)", "phone_base.*"),
-    "place_wine_at_rack_location": ("wine_bottle.*", "wine_rack.*"),
-    "press_switch": ("switch_lever",),
-    "put_knife_on_chopping_board": ("knife_(handle|blade)", "knife_board.*"),
-    "put_rubbish_in_bin": (r"rubbish(_crease\d)?", "rubbish_bin.*"),
-    "stack_blocks": ("stack_target0", "stack_square"),
-    "sweep_to_dustpan": ("broom_(head|bar|handle)", "dustpan_.*"),
-    "take_frame_off_hanger": ("frame_(?!string).*",),
-    "take_off_weighing_scales": ("pepper_{colour}_.*",),
-    "take_umbrella_out_of_umbrella_stand": ("umbrella_(handle|hook.*)",),
-    "take_usb_out_of_computer": ("usb(_connector)?",),
-    "toilet_seat_down": (r"toilet_seat\d",),
-    "unplug_charger": ("charger(_prong.|_light)?",),
-    "water_plants": ("waterer_.*", "plant_.*"),
-}
+from dsvla_jax.sim.tasks.task import fill
 
 
 def object_geoms(environment: Environment, variation: int) -> list[list[int]]:
-    """The geom ids of each of the task's objects, in `OBJECT_GEOMS`' order."""
+    """The geom ids of each of the task's objects, in the order of `Task.objects`.
+
+    Raises UserError if the task names no objects, or a geoms expression matches no geom of the scene.
+    """
     model, task = environment.scene.mj_model, environment.task
+    if not task.objects:
+        raise UserError(
+            f"task {task.name}: objects: expected a TaskObject for each thing that the instruction names, got none; add"
+            " them to the task, or use its own keypoints (--data.keypoints oracle)"
+        )
     names, words = [model.geom(i).name for i in range(model.ngeom)], task.words(variation)
-    # Not str.format: a regular expression may have braces of its own.
-    patterns = [pattern.replace("{colour}", words.get("colour", "")) for pattern in OBJECT_GEOMS[task.name]]
-    return [[i for i, name in enumerate(names) if re.fullmatch(pattern, name)] for pattern in patterns]
+    found = []
+    for each in task.objects:
+        pattern = fill(each.geoms, words)
+        found.append([i for i, name in enumerate(names) if re.fullmatch(pattern, name)])
+        if not found[-1]:
+            raise UserError(
+                f"task {task.name}: objects: expected a geom whose whole name matches {pattern!r}, got "
+                f"{', '.join(filter(None, names))}; correct `geoms` of {each.phrase!r}"
+            )
+    return found
 
 
 def object_masks(environment: Environment, state: SimState) -> np.ndarray:
-    """bool (B, K, H, W): the visible pixels of the K objects of the environment's task, in `OBJECT_GEOMS`' order."""
+    """bool (B, K, H, W): the visible pixels of the K objects of the environment's task, in the order of `objects`."""
     segmentation = np.asarray(environment.render(state)[2])
     return np.array(
         [

@@ -5,7 +5,7 @@ import importlib
 import pkgutil
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.sim.tasks.task import Attachment, Graspable, Placement, StateLayout, StateView, Task
+from dsvla_jax.sim.tasks.task import Attachment, Graspable, Placement, StateLayout, StateView, Task, TaskObject
 
 __all__ = [
     "TASKS",
@@ -15,6 +15,7 @@ __all__ = [
     "StateLayout",
     "StateView",
     "Task",
+    "TaskObject",
     "get_task",
     "select_tasks",
 ]

@@ -99,6 +99,8 @@ TASK = task.Task(
         "take the wand by its handle and move it off the end of the wire",
         "move the ring from the left end to the right end of the wire without touching it",
     ),
+    recognised_by=r"\bbuzz\b|\bwand\b|\bring\b",
+    objects=(task.TaskObject("orange handle", "wand_handle"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -59,6 +59,8 @@ TASK = task.Task(
         "squeeze the ball between the arms and lift it up",
         "raise the ball off the table",
     ),
+    recognised_by=r"\bball\b",
+    objects=(task.TaskObject("ball", "ball"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

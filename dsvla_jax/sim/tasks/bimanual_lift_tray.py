@@ -98,6 +98,8 @@ TASK = task.Task(
         "raise the tray with the yellow block on it",
         "take the tray off the stand and hold it up level",
     ),
+    recognised_by=r"\b(lift|raise|pick up|take) (the )?tray\b",
+    objects=(task.TaskObject("tray", "tray.*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

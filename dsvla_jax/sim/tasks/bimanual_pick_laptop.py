@@ -99,6 +99,8 @@ TASK = task.Task(
         "lift the laptop off its holder with both arms",
         "slide the laptop with one arm and lift it with the other",
     ),
+    recognised_by=r"\b(pick up|pick|push|lift|slide) (the )?laptop\b|\bnotebook\b",
+    objects=(task.TaskObject("laptop", "laptop(?!_holder).*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

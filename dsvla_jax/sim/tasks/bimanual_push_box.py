@@ -80,6 +80,11 @@ TASK = task.Task(
         "slide the heavy box onto the red target",
         "push the box to the red area with both hands",
     ),
+    recognised_by=r"\b(push|slide) (the )?(heavy )?box\b|push the box",
+    objects=(
+        task.TaskObject("box", "box.*"),
+        task.TaskObject("red square", "target"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -120,6 +120,11 @@ TASK = task.Task(
         "grasp each end of the rope in order to pull it straight",
         "put the ends of the red rope on the green squares",
     ),
+    recognised_by=r"\brope\b",
+    objects=(
+        task.TaskObject(("red rope (one end)", "red rope (other end)"), r"rope_(tail|head|\d+)"),
+        task.TaskObject("green block", "rope_.*_target"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -105,6 +105,8 @@ TASK = task.Task(
         "turn the wooden knob until the clock shows a quarter past twelve",
         "move the minute hand of the clock to the three",
     ),
+    recognised_by=r"\bclock\b",
+    objects=(task.TaskObject("wooden button", "clock_knob"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

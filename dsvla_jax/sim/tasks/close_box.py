@@ -96,6 +96,8 @@ TASK = task.Task(
         "take the lid of the box and close it",
         "fold the lid over so that the box is shut",
     ),
+    recognised_by=r"\bbox\b",
+    objects=(task.TaskObject("box with two parts", "box_.*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

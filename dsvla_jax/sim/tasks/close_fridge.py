@@ -92,6 +92,8 @@ TASK = task.Task(
         "push the fridge door shut",
         "close the top door of the fridge",
     ),
+    recognised_by=r"\bfridge\b",
+    objects=(task.TaskObject("fridge", "fridge_.*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -90,6 +90,8 @@ TASK = task.Task(
         "push the screen of the laptop down until it is closed",
         "fold the laptop shut",
     ),
+    recognised_by=r"\blaptop\b",
+    objects=(task.TaskObject("laptop", "laptop_(?!stand).*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

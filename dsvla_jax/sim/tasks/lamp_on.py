@@ -71,6 +71,8 @@ TASK = task.Task(
         "turn the lamp on",
         "push the green light switch to turn on the lamp",
     ),
+    recognised_by=r"\blamp\b|\blight\b",
+    objects=(task.TaskObject("little green light switch", "lamp_button"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

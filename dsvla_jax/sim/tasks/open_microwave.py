@@ -111,6 +111,8 @@ TASK = task.Task(
         "open the door of the microwave by its handle",
         "grasp the small handle and open the microwave",
     ),
+    recognised_by=r"\bmicrowave\b",
+    objects=(task.TaskObject("small handle on microwave", "microwave_handle.*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

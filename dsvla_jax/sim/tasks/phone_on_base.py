@@ -100,6 +100,11 @@ TASK = task.Task(
         "hang up the phone",
         "put the handset back on the telephone",
     ),
+    recognised_by=r"phone\b|\bhandset\b",
+    objects=(
+        task.TaskObject("grey phone near the red base on the desk", "phone_(handle|ear.)"),
+        task.TaskObject("red phone base", "phone_base.*"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

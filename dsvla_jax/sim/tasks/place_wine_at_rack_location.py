@@ -123,6 +123,11 @@ TASK = task.Task(
         "lay the wine into the {slot} slot of the wine rack",
         "slide the bottle onto the {slot} part of the rack",
     ),
+    recognised_by=r"\bwine\b|\bbottle\b",
+    objects=(
+        task.TaskObject("wine", "wine_bottle.*"),
+        task.TaskObject("rack", "wine_rack.*"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -79,6 +79,8 @@ TASK = task.Task(
         "push the lever of the switch to the other side",
         "flip the red switch on the board",
     ),
+    recognised_by=r"\bswitch\b",
+    objects=(task.TaskObject("switch button", "switch_lever"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

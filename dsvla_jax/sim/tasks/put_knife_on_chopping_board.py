@@ -129,6 +129,11 @@ TASK = task.Task(
         "place the knife onto the board",
         "pick up the knife and set it down on the chopping board",
     ),
+    recognised_by=r"\bknife\b",
+    objects=(
+        task.TaskObject("knife", "knife_(handle|blade)"),
+        task.TaskObject("small chopping board on table", "knife_board.*"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -95,6 +95,11 @@ TASK = task.Task(
         "throw away the trash, leaving any other objects alone",
         "pick up the white paper and put it in the black bin",
     ),
+    recognised_by=r"\b(rubbish|trash|white paper)\b",
+    objects=(
+        task.TaskObject("small white rubbish", r"rubbish(_crease\d)?"),
+        task.TaskObject("black bin", "rubbish_bin.*"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -145,6 +145,11 @@ TASK = task.Task(
         "build a tall tower out of {count} {colour} blocks",
         "make a stack of {count} {colour} blocks on the green square",
     ),
+    recognised_by=r"\bblocks?\b",
+    objects=(
+        task.TaskObject("{colour} block", "stack_target0"),
+        task.TaskObject("light green", "stack_square"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -106,6 +106,11 @@ TASK = task.Task(
         "take the broom and clean up the dirt",
         "pick up the brush and sweep the table",
     ),
+    recognised_by=r"\b(sweep|dust|dirt|dustpan|broom)\b",
+    objects=(
+        task.TaskObject("the dark brown long pole with two parts", "broom_(head|bar|handle)"),
+        task.TaskObject("bigger dark dustpan", "dustpan_.*"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -93,6 +93,8 @@ TASK = task.Task(
         "unhang the picture frame and stand it on the table",
         "lift the frame off its peg and set it down",
     ),
+    recognised_by=r"\b(frame|picture)\b",
+    objects=(task.TaskObject("frame", "frame_(?!string).*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -99,6 +99,8 @@ TASK = task.Task(
         "pick the {colour} pepper up from the scales and put it on the table",
         "take the {colour} object off the tray and set it down on the table",
     ),
+    recognised_by=r"\bpepper\b|\bscales\b|off the tray",
+    objects=(task.TaskObject("{colour} pepper", "pepper_{colour}_.*"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

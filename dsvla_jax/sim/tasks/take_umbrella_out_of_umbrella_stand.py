@@ -76,6 +76,8 @@ TASK = task.Task(
         "lift the umbrella up and out of the umbrella stand",
         "remove the umbrella from the stand",
     ),
+    recognised_by=r"\bumbrella\b",
+    objects=(task.TaskObject("umbrella handle", "umbrella_(handle|hook.*)"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

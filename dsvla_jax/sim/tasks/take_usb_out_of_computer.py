@@ -93,6 +93,8 @@ TASK = task.Task(
         "unplug the usb stick from the front of the computer and put it down",
         "grasp the usb and pull it out of its port",
     ),
+    recognised_by=r"\busb\b",
+    objects=(task.TaskObject("small usb", "usb(_connector)?"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -174,6 +174,20 @@ class Attachment:
     position: tuple[float, float, float]
 
 
+@dataclasses.dataclass(frozen=True)
+class TaskObject:
+    """An object that the instruction names.
+
+    phrase: what a detector looks for in a picture: one for all arms, or one for each, the left one first. A phrase that
+        ends in " (one end)" or " (other end)" stands for an end of a long object instead of its centre.
+    geoms: a regular expression of the whole names of the geoms that are the object.
+    In both, "{words}" in braces are filled in by `Task.words`.
+    """
+
+    phrase: str | tuple[str, str]
+    geoms: str
+
+
 def never(view: StateView) -> Array:
     """A predicate that never holds."""
     return jnp.array(False)
@@ -186,6 +200,10 @@ class Task:
     build: adds the task's bodies to an MjSpec that has the table; names begin with the task's own words.
     sample: (PRNG key, variation int32 ()) -> Placement.
     instructions: ways to say the task, the plain one first; {words} in braces are filled in by ``words``.
+    objects: what the instruction names, in its order: what keypoints found in pictures are of. Of several equal objects
+        (blocks of one colour) one.
+    recognised_by: a regular expression that recognises the task in an instruction of other words, lower case. Tasks are
+        asked in the order of their names, and the first that recognises it counts.
     keypoints: view -> float32 (A, K, 3), for each arm the points to go to, in the order of the instruction. A task with
         fewer in some variations repeats the last one.
     success: view -> bool (), after every physics step.
@@ -212,6 +230,8 @@ class Task:
     keypoints: Callable[[StateView], Array]
     success: Callable[[StateView], Array]
     expert: Callable[[StateView], Action]
+    objects: tuple[TaskObject, ...] = ()
+    recognised_by: str = ""
     variations: int = 1
     words: Callable[[int], Mapping[str, str]] = lambda variation: {}
     exclusive: bool = True
@@ -234,6 +254,22 @@ class Task:
         return [
             self.say(variation, way) for variation in range(self.variations) for way in range(len(self.instructions))
         ]
+
+    def phrases(self, words: Mapping[str, str]) -> tuple[tuple[str, ...], ...]:
+        """For each arm the phrases of the objects, in the order of the instruction; `words` fill the braces."""
+        return tuple(
+            tuple(
+                fill(each.phrase if isinstance(each.phrase, str) else each.phrase[arm], words) for each in self.objects
+            )
+            for arm in range(self.num_arms)
+        )
+
+
+def fill(text: str, words: Mapping[str, str]) -> str:
+    """The text with words in the place of their names in braces; other braces, of a regular expression, stay."""
+    for name, word in words.items():
+        text = text.replace(f"{{{name}}}", word)
+    return text
 
 
 def add_part(

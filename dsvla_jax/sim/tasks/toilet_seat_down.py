@@ -93,6 +93,8 @@ TASK = task.Task(
         "lower the seat of the toilet",
         "push the raised toilet seat down",
     ),
+    recognised_by=r"\btoilet\b",
+    objects=(task.TaskObject("toilet seat with two parts", r"toilet_seat\d"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -92,6 +92,8 @@ TASK = task.Task(
         "grasp the charger and pull it out of the wall socket",
         "remove the plug from its socket",
     ),
+    recognised_by=r"\bcharger\b|\bplug\b",
+    objects=(task.TaskObject("the smallest black charger on vertical board", "charger(_prong.|_light)?"),),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,

@@ -142,6 +142,11 @@ TASK = task.Task(
         "pick up the watering can by its handle and pour water onto the plant",
         "give the plant some water",
     ),
+    recognised_by=r"\bplants?\b|\bwatering\b",
+    objects=(
+        task.TaskObject("watering can", "waterer_.*"),
+        task.TaskObject("green plant", "plant_.*"),
+    ),
     keypoints=_keypoints,
     success=_success,
     expert=_expert,
