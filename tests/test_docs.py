@@ -15,6 +15,7 @@ from data_pipelines.episodes import EpisodeReader
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.types import Camera
+from tests.small import SMALL_RUN
 
 DOCS = Path(__file__).parent.parent / "docs"
 

@@ -12,8 +12,8 @@ import pytest
 import train
 from dsvla_jax.checkpoints import CheckpointError
 from dsvla_jax.errors import UserError
-from dsvla_jax.model.clip import REMAT_POLICIES
 from dsvla_jax.model.config import LoraConfig, ModelConfig
+from dsvla_jax.model.layers import REMAT_POLICIES
 from dsvla_jax.model.llama import rotary_tables
 from dsvla_jax.model.lora import merge_lora
 from dsvla_jax.model.partition import make_sharded

@@ -14,19 +14,10 @@ from data_pipelines.episodes import EpisodeReader, write_episodes
 from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from tests.small import SMALL_RUN
 from tests.test_data import random_episode
 
 ROOT = Path(__file__).parent.parent
-
-
-# The smallest model that has every part.
-SMALL = """
-    tiny --run run --log-every 1 --batch-size 2 --encoding.image-size 32 --encoding.patch-size 16
-    --encoding.points.num-points 64 --encoding.points.group-sizes 16 4 --encoding.points.neighbours 4
-    --encoding.points.width 32 --model.vision.image-size 32 --model.vision.patch-size 16 --model.vision.width 32
-    --model.vision.layers 1 --model.vision.heads 2 --model.language.width 32 --model.language.layers 1
-    --model.language.heads 2 --model.language.kv-heads 2 --model.language.ffn 64 --model.scan-unroll 1
-"""
 
 
 def start(folder: Path, options: str) -> subprocess.Popen[str]:
@@ -34,7 +25,7 @@ def start(folder: Path, options: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
     with (folder / "errors").open("w") as errors:
         return subprocess.Popen(
-            [sys.executable, str(ROOT / "train.py"), *SMALL.split(), *options.split()],
+            [sys.executable, str(ROOT / "train.py"), *SMALL_RUN.split(), *options.split()],
             cwd=folder,
             env=environment,
             stdout=subprocess.PIPE,

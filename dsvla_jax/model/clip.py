@@ -1,11 +1,9 @@
-"""CLIP's vision transformer, eating 2D patches and 3D tokens in one sequence.
+"""CLIP's vision transformer over 2D patches and 3D tokens in one sequence.
 
 Radford et al. 2021 (the architecture of openai/CLIP's ViT). The sequence is [CLS | 2D patches | 3D tokens]; a 3D token
 carries the positional embedding of the patch that its centre projects onto (2D-to-3D positional alignment), so the
 pretrained encoder needs no new parameters for it.
 """
-
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -13,13 +11,11 @@ import jax.numpy as jnp
 
 from dsvla_jax.model.attention import attend, join_heads, split_heads
 from dsvla_jax.model.config import ModelConfig
-from dsvla_jax.model.lora import KERNEL_INIT, LoraDense, residual_init
+from dsvla_jax.model.layers import KERNEL_INIT, layer_norm, over_layers, residual_init
+from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
 
 Array = jax.Array
-
-# Short names of jax.checkpoint_policies.
-REMAT_POLICIES = {"full": "nothing_saveable", "dots": "dots_with_no_batch_dims_saveable"}
 
 
 def quick_gelu(x: Array) -> Array:
@@ -33,11 +29,6 @@ def patchify(image: Array, patch_size: int) -> Array:
     grid = size // patch_size
     patches = image.reshape(batch, grid, patch_size, grid, patch_size, channels).swapaxes(2, 3)
     return patches.reshape(batch, grid * grid, patch_size * patch_size * channels)
-
-
-def layer_norm(epsilon: float, name: str) -> nn.LayerNorm:
-    """LayerNorm computed in float32."""
-    return nn.LayerNorm(epsilon=epsilon, dtype=jnp.float32, use_fast_variance=False, name=name)
 
 
 class VisionBlock(nn.Module):
@@ -61,26 +52,6 @@ class VisionBlock(nn.Module):
         y = quick_gelu(LoraDense(vision.ffn, name="up", **options)(y))
         x = x + LoraDense(vision.width, kernel_init=into_residual, name="down", **options)(y)
         return x, None
-
-
-def rematerialised(block, config: ModelConfig) -> Any:
-    """``block`` as the config says that its backward pass is to be done."""
-    if config.remat == "none":
-        return block
-    name = REMAT_POLICIES.get(config.remat, config.remat)
-    return nn.remat(block, prevent_cse=False, policy=getattr(jax.checkpoint_policies, name))
-
-
-def over_layers(block, config: ModelConfig, layers: int, in_axes: Any = nn.broadcast) -> Any:
-    """``block`` scanned over ``layers``: its variables get a leading layers axis; rematerialised as the config says."""
-    return nn.scan(
-        rematerialised(block, config),
-        variable_axes={"params": 0, "lora": 0},
-        split_rngs={"params": True},
-        in_axes=in_axes,
-        length=layers,
-        unroll=config.scan_unroll,
-    )
 
 
 class VisionTower(nn.Module):
@@ -132,18 +103,3 @@ class VisionTower(nn.Module):
             return x
         projection = self.param("projection", KERNEL_INIT, (vision.width, vision.embed_width))
         return x.astype(dtype) @ projection.astype(dtype)
-
-
-class Projector(nn.Module):
-    """Vision outputs -> language width, LayerNorm last: the visual tokens of the prompt."""
-
-    config: ModelConfig
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        width, dtype = self.config.language.width, self.config.compute_dtype
-        options = {"use_bias": True, "dtype": dtype, "kernel_init": KERNEL_INIT}
-        if self.config.projector == "mlp":
-            x = nn.gelu(LoraDense(width, name="hidden", **options)(x))
-        x = LoraDense(width, name="linear", **options)(x)
-        return layer_norm(1e-5, "norm")(x).astype(dtype)

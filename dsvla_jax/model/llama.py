@@ -12,9 +12,9 @@ import numpy as np
 from flax import struct
 
 from dsvla_jax.model.attention import attend, join_heads, split_heads
-from dsvla_jax.model.clip import over_layers, rematerialised
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
-from dsvla_jax.model.lora import LoraDense, residual_init
+from dsvla_jax.model.layers import over_layers, rematerialised, residual_init
+from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
 
 Array = jax.Array

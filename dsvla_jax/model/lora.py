@@ -15,17 +15,10 @@ import jax.numpy as jnp
 from flax import traverse_util
 
 from dsvla_jax.model.config import LoraConfig
+from dsvla_jax.model.layers import KERNEL_INIT, Initializer
 from dsvla_jax.model.quantize import SCALE, dequantize
 
 Array = jax.Array
-Initializer = Any
-
-KERNEL_INIT = nn.initializers.lecun_normal()
-
-
-def residual_init(layers: int) -> Initializer:
-    """Kernels that write into a residual stream which 2 * layers of them add to, so that its variance stays bounded."""
-    return nn.initializers.variance_scaling(1.0 / (2 * layers), "fan_in", "truncated_normal")
 
 
 def _adapter_init(kind: str) -> Initializer:

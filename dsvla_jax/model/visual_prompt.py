@@ -10,10 +10,10 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from dsvla_jax.model.clip import layer_norm, over_layers
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
+from dsvla_jax.model.layers import KERNEL_INIT, layer_norm, over_layers
 from dsvla_jax.model.llama import DecoderBlock, LayerPrompts, PromptTokens, RMSNorm, rotary_tables
-from dsvla_jax.model.lora import KERNEL_INIT, LoraDense
+from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
 
 Array = jax.Array

@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dsvla_jax.model.clip import Projector, VisionTower
+from dsvla_jax.model.clip import VisionTower
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
+from dsvla_jax.model.layers import KERNEL_INIT, layer_norm
 from dsvla_jax.model.llama import KVCache, LayerPrompts, Llama, PromptTokens
+from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.quantize import quantize
 from dsvla_jax.model.visual_prompt import VisualPrompt
 from dsvla_jax.types import ModelInputs
@@ -22,6 +24,21 @@ Array = jax.Array
 # Shortest and longest wavelength of the number embeddings, in integers. The shortest tells neighbours apart, the
 # longest is twice the span of all numbers (-100..200), so that its phase never repeats.
 NUMBER_WAVELENGTHS = (4.0, 600.0)
+
+
+class Projector(nn.Module):
+    """Vision outputs -> language width, LayerNorm last: the visual tokens of the prompt."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        width, dtype = self.config.language.width, self.config.compute_dtype
+        options = {"use_bias": True, "dtype": dtype, "kernel_init": KERNEL_INIT}
+        if self.config.projector == "mlp":
+            x = nn.gelu(LoraDense(width, name="hidden", **options)(x))
+        x = LoraDense(width, name="linear", **options)(x)
+        return layer_norm(1e-5, "norm")(x).astype(dtype)
 
 
 class VLA(nn.Module):
