@@ -59,6 +59,6 @@ format: setup  ## format the code
 lock: setup  ## resolve requirements.lock again
 	$(VENV)/bin/uv pip compile --universal --generate-hashes --no-header -q pyproject.toml --extra dev -o requirements.lock
 
-clean:  ## remove caches and virtual environments; runs/, data/, bases/ and words/ stay
+clean:  ## remove caches and virtual environments; results and data stay
 	rm -rf .venv-3.* .cache .pytest_cache .ruff_cache dist MUJOCO_LOG.TXT
 	find . -name .git -prune -o -path ./runs -prune -o -path ./data -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

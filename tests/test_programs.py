@@ -30,7 +30,7 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (["train.py", "tinny"], "unknown config 'tinny': did you mean 'tiny'?"),
         (
             ["train.py", "mine/tiny_lor.py"],
-            "unknown config 'mine/tiny_lor.py': no such file; did you mean 'tiny_lora'?",
+            "'mine/tiny_lor.py': no such file; did you mean 'tiny_lora'?",
         ),
         (["train.py", "tiny", "--optimizer.learning-rat", "1"], "learning-rate"),
         (["train.py", "tiny", "--steps", "many"], "many"),
