@@ -63,7 +63,7 @@ def find_commands(page: Path, root: Path = ROOT) -> list[Command]:
             line = text.count("\n", 0, match.start()) + 2
             commands += [Command(name, line + i, command, True) for i, command in split_block(match[2])]
     sentences = blocks.sub(lambda match: "\n" * match[0].count("\n"), text)
-    for match in re.finditer(rf"`({BEGINNINGS}[^`]+)`", sentences):
+    for match in re.finditer(rf"`({BEGINNINGS}(?!-m`)[^`]+)`", sentences):
         line = sentences.count("\n", 0, match.start()) + 1
         commands.append(Command(name, line, " ".join(match[1].split()), False))
     return sorted(commands, key=lambda command: command.line)
@@ -137,7 +137,7 @@ def problem_with_packages(packages: list[str]) -> str | None:
     """Returns the first extra that pyproject.toml does not have, or package of this name, which no index has."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for package in packages:
-        if package.startswith("dsvla"):
+        if package.startswith("dsvla") and "@ git+" not in package:
             return f"{package} is on no index: install from a clone, as in pip install -e ."
         if extra := re.fullmatch(r"\.\[(.*)\]", package):
             missing = [name for name in extra[1].split(",") if name not in extras]

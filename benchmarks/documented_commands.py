@@ -74,6 +74,7 @@ RULES = (
     Rule("^make bench"),
     Rule("^make (parity|lock)", only_parsed="installs PyTorch and TensorFlow, or resolves the lock again"),
     Rule(r"^pip install -e \S*(perception|parity)", only_parsed="installs PyTorch"),
+    Rule("git.URL", only_parsed="needs the address of a repository"),
     Rule("^pip install"),
     Rule("^(sbatch|kubectl)", only_parsed="needs a cluster"),
     Rule("^gsutil|gs://", only_parsed="reads a bucket"),
@@ -213,7 +214,7 @@ def run_page(clone: Clone, page: Path, earlier: list[Result], console: Console) 
         file.write_text(text)
     results: list[Result] = []
     with contextlib.ExitStack() as servers:
-        for command in find_commands(page):
+        for command in find_commands(page, clone.folder):
             rule, started = rule_of(command), time.monotonic()
             text = text_to_run(command, rule) if rule else command.text
             same = next((result.where for result in [*earlier, *results] if result.text == text), "")
@@ -255,12 +256,19 @@ def prepare(clone: Clone) -> None:
         (clone.folder / "data" / "oxe").symlink_to("oxe_fixtures")
 
 
+def chosen_pages(options: Options, root: Path) -> list[Path]:
+    """Returns the pages that the options ask for; all if they name none."""
+    every = {page.relative_to(root).as_posix(): page for page in pages(root)}
+    if unknown := [name for name in options.pages if name not in every]:
+        raise UserError(f"--pages: no page {unknown[0]!r}; expected some of: {', '.join(every)}")
+    return [page for name, page in every.items() if not options.pages or name in options.pages]
+
+
 def main(options: Options) -> int:
     """Runs all; 0 if every command does what it should."""
     console = Console(width=200)
-    chosen = [page for page in pages() if not options.pages or page.relative_to(ROOT).as_posix() in options.pages]
     if options.list:
-        for command in (command for page in chosen for command in find_commands(page)):
+        for command in (command for page in chosen_pages(options, ROOT) for command in find_commands(page)):
             rule = rule_of(command)
             text = f"not run: {rule.only_parsed}" if rule and rule.only_parsed else rule and text_to_run(command, rule)
             console.print(f"{command.where}  {command.text}\n    {text}", markup=False)
@@ -271,7 +279,7 @@ def main(options: Options) -> int:
         started = time.monotonic()
         prepare(clone)
         results = [Result("README.md", "git clone; make setup", "ok", time.monotonic() - started)]
-        for page in chosen:
+        for page in chosen_pages(options, clone.folder):
             results += run_page(clone, page, results, console)
             results += [Result(page.name, line, "not in an ```sh block") for line in indented_commands(page)]
     finally:
