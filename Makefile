@@ -5,17 +5,21 @@ VENV := .venv-$(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info
 PY := $(VENV)/bin/python
 CONFIG ?= tiny
 RUN ?= runs/$(CONFIG)
+# Further options of train.py and eval.py, as in: make train TRAIN_OPTIONS="--steps 100"
+TRAIN_OPTIONS ?=
+EVAL_OPTIONS ?=
 
-.PHONY: help train test test-slow bench lint format lock clean
+.PHONY: help setup train test test-slow parity bench lint format lock clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
 
-$(VENV)/.synced: requirements.lock
+$(VENV)/.synced: requirements.lock pyproject.toml
 	@test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	@test -x $(VENV)/bin/uv || $(PY) -m pip install --quiet --disable-pip-version-check uv
 	@echo "installing the locked packages into $(VENV)"
 	@$(VENV)/bin/uv pip sync --quiet --python $(PY) requirements.lock
+	@$(VENV)/bin/uv pip install --quiet --python $(PY) --no-deps --editable .
 	@$(PY) -m pip --version >/dev/null
 	@$(VENV)/bin/uv --version >/dev/null 2>&1 || $(PY) -m pip install --quiet --disable-pip-version-check uv
 	@touch $@
@@ -23,8 +27,8 @@ $(VENV)/.synced: requirements.lock
 setup: $(VENV)/.synced  ## make the virtual environment
 
 train: setup  ## demonstrations, training, closed-loop evaluation and report for CONFIG (default: tiny)
-	$(PY) train.py $(CONFIG) --run $(RUN)
-	$(PY) eval.py $(RUN) --skip-finished
+	$(PY) train.py $(CONFIG) --run $(RUN) $(TRAIN_OPTIONS)
+	$(PY) eval.py $(RUN) --skip-finished $(EVAL_OPTIONS)
 	@echo "report: $(RUN)/eval/mujoco.html"
 
 test: setup  ## the test suite, on up to four cores
@@ -53,4 +57,8 @@ format: setup  ## format the code
 	$(PY) -m ruff check --fix .
 
 lock: setup  ## resolve requirements.lock again
-	$(VENV)/bin/uv pip compile --universal --generate-hashes --no-header -q pyproject.toml -o requirements.lock
+	$(VENV)/bin/uv pip compile --universal --generate-hashes --no-header -q pyproject.toml --extra dev -o requirements.lock
+
+clean:  ## remove caches and virtual environments; results and data stay
+	rm -rf .venv-3.* .cache .pytest_cache .ruff_cache dist MUJOCO_LOG.TXT
+	find . -name .git -prune -o -path ./runs -prune -o -path ./data -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -170,10 +170,15 @@ def load_strips(file: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str,
     return {key: [picture[..., ::-1]] for key, picture in pictures.items() if picture is not None}
 
 
-if __name__ == "__main__":
+def program() -> None:
+    """Runs the program: `python eval.py`, or `dsvla-eval` where the project is installed."""
     with fail_with_message():
         parsed = tyro.cli(Options, prog="eval.py", description=__doc__)
         configure_jax(parsed.physics)
         started = time.monotonic()
         main(parsed)
         print(f"{time.monotonic() - started:.0f} s", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    program()

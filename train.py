@@ -1,8 +1,9 @@
 """Train 3DS-VLA: python train.py CONFIG [--run DIR] [--steps 500 --optimizer.learning-rate 3e-4 ...]
 
-CONFIG names a file of configs/. Demonstrations are generated first where they are missing. The run folder receives the
-config, the vocabulary, checkpoints, and metrics (metrics.jsonl and TensorBoard). A run that was stopped, or killed,
-goes on when the same command is given again; a finished one is left as it is.
+CONFIG is a name of configs/, or the path of a Python file of your own with a function `config() -> Experiment`.
+Demonstrations are generated first where they are missing. The run folder receives the config, the vocabulary,
+checkpoints, and metrics (metrics.jsonl and TensorBoard). A run that was stopped, or killed, goes on when the same
+command is given again; a finished one is left as it is.
 """
 
 import contextlib
@@ -311,7 +312,7 @@ def command_line(arguments: list[str]) -> None:
 
     def train_run(
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = experiment,
-        run: Path = Path("runs") / name,
+        run: Path = Path("runs") / Path(name).stem,
         wandb: str = "",
         profile: int = 0,
     ) -> int:
@@ -329,6 +330,11 @@ def command_line(arguments: list[str]) -> None:
     sys.exit(tyro.cli(train_run, args=rest, prog=f"train.py {name}", config=(tyro.conf.AvoidSubcommands,)))
 
 
-if __name__ == "__main__":
+def program() -> None:
+    """Runs the program: `python train.py`, or `dsvla-train` where the project is installed."""
     with fail_with_message():
         command_line(sys.argv[1:])
+
+
+if __name__ == "__main__":
+    program()

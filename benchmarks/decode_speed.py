@@ -106,7 +106,7 @@ def largest_difference(model: Any, embeddings: np.ndarray, grammar: AnswerGramma
 def main(options: Options) -> int:
     missing = [name for name in ("torch", "transformers") if find_spec(name) is None]
     if missing:
-        print(f"{' and '.join(missing)} missing: pip install 'dsvla-jax[parity]'", file=sys.stderr)
+        print(f"{' and '.join(missing)} missing: pip install torch transformers peft", file=sys.stderr)
         return UNAVAILABLE
     import torch  # pyright: ignore[reportMissingImports]
 

@@ -2,7 +2,7 @@
 
 Usage: python -m benchmarks.device_loop_tpu [--task lamp_on] [--episodes 64]
 
-Ahead of time and from any CPU: it needs the libtpu package (pip install "dsvla-jax[planner]"), not a TPU. Exits with 77
+Ahead of time and from any CPU: it needs the libtpu package (pip install libtpu), not a TPU. Exits with 77
 where libtpu is missing, with 1 where the program does not fit. Weights are bfloat16, split over all chips; episodes
 are spread over them. In place of LLaMA's vocabulary, one of 32,000 words, with an integer a token.
 """
@@ -54,7 +54,7 @@ def words(count: int, instructions: list[str]) -> WordTokenizer:
 def main(options: Options) -> int:
     where = find_slice("v5e:4x4")
     if where.virtual:
-        print("no TPU compiler: pip install 'dsvla-jax[planner]'", file=sys.stderr)
+        print("no TPU compiler: pip install libtpu", file=sys.stderr)
         return NO_LIBTPU
     mesh = make_mesh(MeshConfig(data=1, fsdp=-1), where.devices)
     experiment = paper_7b()

@@ -195,7 +195,7 @@ def main() -> int:
     try:
         import tensorflow  # noqa: F401
     except ImportError:
-        print("error: TensorFlow is missing; install the extra: pip install '.[tensorflow]'", file=sys.stderr)
+        print("error: TensorFlow is missing: pip install tensorflow-cpu", file=sys.stderr)
         return 1
     failed = 0
     with tempfile.TemporaryDirectory() as folder:

@@ -99,7 +99,7 @@ def shortcomings(plans: list[dict[str, Any]]) -> list[str]:
 
 def main(options: Options) -> int:
     if find_spec("libtpu") is None:
-        print("no TPU compiler: pip install 'dsvla-jax[planner]'", file=sys.stderr)
+        print("no TPU compiler: pip install libtpu", file=sys.stderr)
         return NO_LIBTPU
     plans = compile_plans(options)
     text = table(plans, options.config)

@@ -3,7 +3,7 @@
 Usage: python -m benchmarks.tpu_compile [--tasks ...] [--episodes 1024] [--out docs/tpu_compile.json]
 then python -m docs.gallery writes the figures into docs/tasks.md.
 
-Ahead of time and from any CPU: it needs the libtpu package (pip install "dsvla-jax[planner]"), not a TPU. Exits with 77
+Ahead of time and from any CPU: it needs the libtpu package (pip install libtpu), not a TPU. Exits with 77
 where libtpu is missing. With --out, tasks that the file already has are not compiled again.
 """
 
@@ -72,7 +72,7 @@ def compile_keyframe(name: str, episodes: int, mesh: Mesh) -> dict[str, Any]:
 def main(options: Options) -> int:
     where = find_slice("v5e:2x2")
     if where.virtual:
-        print("no TPU compiler: pip install 'dsvla-jax[planner]'", file=sys.stderr)
+        print("no TPU compiler: pip install libtpu", file=sys.stderr)
         return NO_LIBTPU
     mesh = Mesh(np.array(where.devices), ("data",))
     results = json.loads(options.out.read_text()) if options.out and options.out.exists() else {}

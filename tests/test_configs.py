@@ -1,12 +1,15 @@
 """The configs of Table 3's rows: each trains, and each differs from the next in exactly what its row says."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import configs
 from configs import config_names, get_config
 from data_pipelines.episodes import Frame
 from data_pipelines.samples import make_sampler, suite_tokenizer
@@ -109,6 +112,54 @@ def test_every_config_loads_and_a_typo_names_the_nearest():
         assert isinstance(get_config(name), Experiment)
     with pytest.raises(UserError, match="unknown config 'tiny_lore': did you mean 'tiny_lora'"):
         get_config("tiny_lore")
+
+
+OWN = """
+import dataclasses
+
+from configs.tiny import config as tiny
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    steps: int = 3
+
+
+def config():
+    return dataclasses.replace(tiny(), steps=Settings().steps)
+"""
+
+
+def test_a_config_is_a_name_or_the_path_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "mine" / "own.py"
+    file.parent.mkdir()
+    file.write_text(OWN)
+    expected = replace(get_config("tiny"), steps=3)
+    assert get_config("mine/own.py") == get_config(str(file)) == expected
+    assert get_config("configs/tiny.py") == get_config(str(Path(configs.__file__).with_name("tiny.py")))
+    # A file of that name in the working directory is meant, not the project's.
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "tiny.py").write_text(OWN)
+    assert get_config("configs/tiny.py") == expected
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "unknown config 'own.py': no such file; expected the path of a Python file with a function config"),
+        ("steps = 3", "own.py: no function config() in this file"),
+        ("def config():\n    return 3", "own.py: config() must return an Experiment, got int"),
+    ],
+)
+def test_a_file_without_an_experiment_is_refused(
+    content: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    if content is not None:
+        (tmp_path / "own.py").write_text(content)
+    with pytest.raises(UserError, match=re.escape(message)):
+        get_config("own.py")
 
 
 def test_every_instruction_of_the_suite_fits_the_tiny_text():

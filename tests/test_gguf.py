@@ -8,7 +8,7 @@ import pytest
 from dsvla_jax.weights.sources import read_language
 from dsvla_jax.weights.tensors import WeightsError
 
-gguf = pytest.importorskip("gguf", reason='needs the package gguf: pip install "dsvla-jax[gguf]"')
+gguf = pytest.importorskip("gguf", reason="needs the package gguf: pip install gguf")
 
 LAYERS, WIDTH, HEADS, KV_HEADS, HEAD_DIM, FFN, VOCAB = 2, 64, 4, 2, 16, 96, 31
 NAMES = {

@@ -28,6 +28,10 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     ("arguments", "expected"),
     [
         (["train.py", "tinny"], "unknown config 'tinny': did you mean 'tiny'?"),
+        (
+            ["train.py", "mine/tiny_lor.py"],
+            "'mine/tiny_lor.py': no such file; did you mean 'tiny_lora'?",
+        ),
         (["train.py", "tiny", "--optimizer.learning-rat", "1"], "learning-rate"),
         (["train.py", "tiny", "--steps", "many"], "many"),
         (["train.py", "tiny", "--data.tasks", "lamp_of"], "lamp_on"),

@@ -16,6 +16,7 @@ from dsvla_jax.perception.phrases import ObjectPhrases, load_table
 
 DETECTOR = "IDEA-Research/grounding-dino-tiny"
 SEGMENTER = "facebook/sam-vit-huge"
+INSTALL = "install what it needs with: pip install torch torchvision transformers pillow"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,11 +70,7 @@ class GroundedSegmenter:
         """The models of two names on the Hugging Face hub, or folders. Raises UserError where they cannot be had."""
         try:
             import transformers  # type: ignore[import-not-found]
-        except ModuleNotFoundError as error:
-            raise UserError(
-                f"perception: {error.name} is missing; install the extra: pip install 'dsvla-jax[perception]'"
-            ) from error
-        try:
+
             return cls(
                 transformers.GroundingDinoForObjectDetection.from_pretrained(detector),
                 transformers.GroundingDinoProcessor.from_pretrained(detector),
@@ -82,6 +79,10 @@ class GroundedSegmenter:
                 box_threshold,
                 device,
             )
+        except ImportError as error:
+            # Without torch or torchvision, transformers is there and its models are not.
+            reason = f"{error.name} is missing" if error.name else str(error).strip().splitlines()[0]
+            raise UserError(f"perception: {reason}; {INSTALL}") from error
         except (OSError, ValueError) as error:
             raise UserError(
                 f"perception: cannot load {detector} and {segmenter} ({error}); give folders that hold them where the "

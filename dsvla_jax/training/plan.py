@@ -1,9 +1,9 @@
 """Plan a run on a TPU slice that is not there: python -m dsvla_jax.training.plan CONFIG --topology v5e:4x4 [...]
 
-CONFIG is a name or a file of configs/; each of its fields can be overridden, as for train.py. Compiles the real
-training step and decoding step ahead of time (the libtpu package does it on any processor: pip install
-"dsvla-jax[planner]") and prints memory, FLOPs, communication and time a chip. Without libtpu it compiles for virtual
-CPU devices, whose memory figures differ from a TPU's. Exits with 3 where nothing fits.
+CONFIG is a name or a file, and each of its fields can be overridden, as for train.py. Compiles the real training step
+and decoding step ahead of time (the libtpu package does it on any processor: pip install libtpu) and prints memory,
+FLOPs, communication and time a chip. Without libtpu it compiles for virtual CPU devices, whose memory figures differ
+from a TPU's. Exits with 3 where nothing fits.
 """
 
 import dataclasses
@@ -106,7 +106,7 @@ def main(experiment: Experiment, options: Options) -> int:
     """Plans an experiment on a slice, prints each plan, and returns the exit status."""
     where = find_slice(options.topology)
     if where.virtual:
-        print("no TPU compiler (pip install 'dsvla-jax[planner]'): planning on virtual CPU devices", file=sys.stderr)
+        print("no TPU compiler (pip install libtpu): planning on virtual CPU devices", file=sys.stderr)
     elif experiment.model.attention == "auto":
         # That would be chosen for the processor that compiles.
         experiment = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, attention="fused"))

@@ -52,7 +52,7 @@ def _package() -> Any:
     try:
         import gguf  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise WeightsError('GGUF files need the package gguf: pip install "dsvla-jax[gguf]"') from error
+        raise WeightsError("GGUF files need the package gguf: pip install gguf") from error
     return gguf
 
 
