@@ -152,7 +152,8 @@ class RunCheckpoints:
 
     def restore(self, arrays: Mapping[str, Any], step: int | None = None) -> Restored:
         """A step, the newest by default, with the structures, shapes and shardings of `arrays`, which names what is
-        wanted of `ARRAYS`. It may have been saved from another mesh and another number of processes.
+        wanted of `ARRAYS`. It may have been saved from another mesh and another number of processes. Leaves without a
+        sharding are restored to the first device.
 
         Raises CheckpointError where there is no such step, or where it belongs to a model of another size.
         """
@@ -341,4 +342,13 @@ def _tree(metadata: Any) -> Any:
 
 
 def _abstract(tree: Any) -> Any:
-    return jax.tree.map(ocp.utils.to_shape_dtype_struct, tree)
+    """What orbax is to restore: leaves without a sharding go to one device, whatever devices they were saved from."""
+    # Orbax would otherwise look for the devices that saved them.
+    here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+
+    def abstract(leaf: Any) -> Any:
+        struct = ocp.utils.to_shape_dtype_struct(leaf)
+        lacks_sharding = isinstance(struct, jax.ShapeDtypeStruct) and struct.sharding is None
+        return struct.update(sharding=here) if lacks_sharding else struct
+
+    return jax.tree.map(abstract, tree)
