@@ -34,6 +34,7 @@ from dsvla_jax.errors import UserError
 
 ARRAYS = ("trainable", "optimizer", "counters", "rng")
 NOTES = ("iterator", "config")
+ARRAY_INDEX = "manifest.ocdbt"
 
 _log = logging.getLogger(__name__)
 
@@ -43,6 +44,19 @@ class CheckpointError(UserError):
 
 
 logging.getLogger("absl").setLevel(logging.WARNING)
+
+# Orbax looks for what it wrote with a pattern that begins with the folder's own path; TensorStore takes a backslash for
+# a slash.
+PATTERN_CHARACTERS, SEPARATOR = "[*?", "\\"
+
+
+def require_writable_path(folder: Path, characters: str = PATTERN_CHARACTERS + SEPARATOR) -> None:
+    """Raises CheckpointError if the absolute path has any of the characters: arrays written there could not be read."""
+    if found := [character for character in characters if character in str(folder.absolute())]:
+        raise CheckpointError(
+            f"{folder.absolute()}: arrays cannot be stored in a folder whose path contains {' or '.join(found)}; "
+            "choose another folder"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,13 +100,15 @@ class RunCheckpoints:
     read_only: for all but the program that trains the run: touches nothing.
 
     On opening, a newest step that is not as it was written is reported and, unless `read_only`, put aside; the newest
-    whole one takes its place.
+    whole one takes its place. Raises CheckpointError for a path that nothing can be stored at.
     """
 
     def __init__(self, run: Path, *, keep: int = 2, read_only: bool = False):
+        require_writable_path(run, SEPARATOR if read_only else PATTERN_CHARACTERS + SEPARATOR)
         self.folder = run.absolute() / "checkpoints"
         self._base = run.absolute() / "base"
         self._read_only = read_only
+        self._saving: tuple[str, ...] = ()
         self._newest = _first_process_decides(lambda: _tidy(self.folder, read_only))
         if read_only:
             options = ocp.CheckpointManagerOptions(read_only=True, create=False, best_fn=_rank)
@@ -136,6 +152,7 @@ class RunCheckpoints:
         items |= {name: ocp.args.JsonSave(note) for name, note in notes.items()}
         with self._explained():
             self._manager.wait_until_finished()
+            self._saving = tuple(name for name, tree in arrays.items() if jax.tree.leaves(tree))
             self._manager.save(
                 step, args=ocp.args.Composite(**items), metrics={} if score is None else {"score": score}
             )
@@ -174,6 +191,7 @@ class RunCheckpoints:
             with ocp.StandardCheckpointer() as checkpointer:
                 checkpointer.save(self._base, frozen, force=True)
             if jax.process_index() == 0:
+                _require_index(self._base)
                 write_digests(self._base, top=True)
 
     def restore_base(self, like: Any) -> Any:
@@ -237,6 +255,8 @@ class RunCheckpoints:
         # Called in the background when all files of a step are written, before the folder gets its final name.
         if jax.process_index() == 0:
             for folder in self.folder.glob("*.orbax-checkpoint-tmp"):
+                for name in self._saving:
+                    _require_index(folder / name)
                 # Orbax goes on writing to the files at the top; they hold nothing that is restored.
                 write_digests(folder, top=False)
 
@@ -259,6 +279,12 @@ class RunCheckpoints:
             self.wait()
         finally:
             self._manager.close()
+
+
+def _require_index(item: Path) -> None:
+    """Raises CheckpointError if arrays were written without the index through which they are found."""
+    if not (item / ARRAY_INDEX).is_file():
+        raise CheckpointError(f"{item}: {ARRAY_INDEX} is missing, so its arrays could not be read")
 
 
 def _steps(folder: Path) -> list[int]:
