@@ -79,11 +79,17 @@ def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "",
     if stopped is not None:
         print(f"{stopped.name}: {run} is saved at step {step_reached}; the same command goes on from there")
         return EXIT_STATUS[stopped]
+    print(f"trained: {run} ({advice(experiment)} {run})")
+    return 0
+
+
+def advice(experiment: Experiment) -> str:
+    """What to do with a finished run: words that the run's folder follows."""
+    if experiment.oxe is not None:
+        return "finetune it in simulation with: python train.py CONFIG --base"
     # The simulator does not have the tasks of one's own demonstrations.
     simulated = set(experiment.data.tasks) <= TASKS.keys()
-    use = "evaluate it with: python eval.py" if simulated else "serve it with: python -m dsvla_jax.serving"
-    print(f"trained: {run} ({use} {run})")
-    return 0
+    return "evaluate it with: python eval.py" if simulated else "serve it with: python -m dsvla_jax.serving"
 
 
 def train(

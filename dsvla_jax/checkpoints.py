@@ -14,6 +14,7 @@ Weights imported from elsewhere are a folder of their own (`dsvla_jax.weights.fo
 
 import contextlib
 import dataclasses
+import hashlib
 import logging
 import math
 import shutil
@@ -213,7 +214,7 @@ class RunCheckpoints:
 
         step: a number, "best", or the newest if not given.
         """
-        number = self._require_step(self.best_step if step == "best" else step)
+        number = self._require_step(self._number(step))
         flat = traverse_util.flatten_dict(like)
         stored = traverse_util.flatten_dict(_tree(self._manager.item_metadata(number)["trainable"]))
         frozen = {path: leaf for path, leaf in flat.items() if path not in stored} if self._base.exists() else {}
@@ -222,6 +223,21 @@ class RunCheckpoints:
         variables = traverse_util.flatten_dict(restored.arrays["trainable"])
         variables |= traverse_util.flatten_dict(self.restore_base(traverse_util.unflatten_dict(frozen)))
         return traverse_util.unflatten_dict(variables)
+
+    def identify(self, step: int | Literal["best"] | None = None) -> tuple[int, str]:
+        """The step that `restore_variables` restores, and a digest of all that it would read."""
+        number = self._require_step(self._number(step))
+        files = [self.folder / str(number) / DIGESTS, self._base / DIGESTS]
+        content = b"".join(file.read_bytes() for file in files if file.exists())
+        return number, hashlib.sha256(content).hexdigest()[:16]
+
+    def _number(self, step: int | Literal["best"] | None) -> int | None:
+        if step == "best" and self.best_step is None:
+            raise CheckpointError(
+                f"{self.folder}: no checkpoint was scored, so none is the best; name a step, or train with "
+                "--validate-every or --evaluate-every"
+            )
+        return self.best_step if step == "best" else step
 
     def list_variables(self) -> dict[tuple[str, ...], StoredVariable]:
         """Every variable of the newest step, trained or frozen, by its path; none is read."""
