@@ -26,7 +26,7 @@ from configs import config_names, get_config
 from data_pipelines.loader import make_loader
 from data_pipelines.samples import make_sampler, make_validation_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations, open_held_out
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes
+from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes, require_writable_path
 from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.number_targets import number_rows
@@ -58,6 +58,7 @@ PADDING_ROWS = 1024
 
 def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "", profile: int = 0) -> int:
     """Trains one experiment into the run folder, or goes on from its newest checkpoint. Returns the exit status."""
+    require_writable_path(run)
     tokenizer = tokenizer_of(experiment)
     if experiment.oxe is None:
         tasks = choose_tasks(experiment.data)
@@ -79,11 +80,17 @@ def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "",
     if stopped is not None:
         print(f"{stopped.name}: {run} is saved at step {step_reached}; the same command goes on from there")
         return EXIT_STATUS[stopped]
+    print(f"trained: {run} ({advice(experiment)} {run})")
+    return 0
+
+
+def advice(experiment: Experiment) -> str:
+    """What to do with a finished run: words that the run's folder follows."""
+    if experiment.oxe is not None:
+        return "finetune it in simulation with: python train.py CONFIG --base"
     # The simulator does not have the tasks of one's own demonstrations.
     simulated = set(experiment.data.tasks) <= TASKS.keys()
-    use = "evaluate it with: python eval.py" if simulated else "serve it with: python -m dsvla_jax.serving"
-    print(f"trained: {run} ({use} {run})")
-    return 0
+    return "evaluate it with: python eval.py" if simulated else "serve it with: python -m dsvla_jax.serving"
 
 
 def train(

@@ -14,6 +14,7 @@ Weights imported from elsewhere are a folder of their own (`dsvla_jax.weights.fo
 
 import contextlib
 import dataclasses
+import hashlib
 import logging
 import math
 import shutil
@@ -34,6 +35,7 @@ from dsvla_jax.errors import UserError
 
 ARRAYS = ("trainable", "optimizer", "counters", "rng")
 NOTES = ("iterator", "config")
+ARRAY_INDEX = "manifest.ocdbt"
 
 _log = logging.getLogger(__name__)
 
@@ -43,6 +45,19 @@ class CheckpointError(UserError):
 
 
 logging.getLogger("absl").setLevel(logging.WARNING)
+
+# Orbax looks for what it wrote with a pattern that begins with the folder's own path; TensorStore takes a backslash for
+# a slash.
+PATTERN_CHARACTERS, SEPARATOR = "[*?", "\\"
+
+
+def require_writable_path(folder: Path, characters: str = PATTERN_CHARACTERS + SEPARATOR) -> None:
+    """Raises CheckpointError if the absolute path has any of the characters: arrays written there could not be read."""
+    if found := [character for character in characters if character in str(folder.absolute())]:
+        raise CheckpointError(
+            f"{folder.absolute()}: arrays cannot be stored in a folder whose path contains {' or '.join(found)}; "
+            "choose another folder"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,13 +101,15 @@ class RunCheckpoints:
     read_only: for all but the program that trains the run: touches nothing.
 
     On opening, a newest step that is not as it was written is reported and, unless `read_only`, put aside; the newest
-    whole one takes its place.
+    whole one takes its place. Raises CheckpointError for a path that nothing can be stored at.
     """
 
     def __init__(self, run: Path, *, keep: int = 2, read_only: bool = False):
+        require_writable_path(run, SEPARATOR if read_only else PATTERN_CHARACTERS + SEPARATOR)
         self.folder = run.absolute() / "checkpoints"
         self._base = run.absolute() / "base"
         self._read_only = read_only
+        self._saving: tuple[str, ...] = ()
         self._newest = _first_process_decides(lambda: _tidy(self.folder, read_only))
         if read_only:
             options = ocp.CheckpointManagerOptions(read_only=True, create=False, best_fn=_rank)
@@ -136,6 +153,7 @@ class RunCheckpoints:
         items |= {name: ocp.args.JsonSave(note) for name, note in notes.items()}
         with self._explained():
             self._manager.wait_until_finished()
+            self._saving = tuple(name for name, tree in arrays.items() if jax.tree.leaves(tree))
             self._manager.save(
                 step, args=ocp.args.Composite(**items), metrics={} if score is None else {"score": score}
             )
@@ -152,7 +170,8 @@ class RunCheckpoints:
 
     def restore(self, arrays: Mapping[str, Any], step: int | None = None) -> Restored:
         """A step, the newest by default, with the structures, shapes and shardings of `arrays`, which names what is
-        wanted of `ARRAYS`. It may have been saved from another mesh and another number of processes.
+        wanted of `ARRAYS`. It may have been saved from another mesh and another number of processes. Leaves without a
+        sharding are restored to the first device.
 
         Raises CheckpointError where there is no such step, or where it belongs to a model of another size.
         """
@@ -173,6 +192,7 @@ class RunCheckpoints:
             with ocp.StandardCheckpointer() as checkpointer:
                 checkpointer.save(self._base, frozen, force=True)
             if jax.process_index() == 0:
+                _require_index(self._base)
                 write_digests(self._base, top=True)
 
     def restore_base(self, like: Any) -> Any:
@@ -194,7 +214,7 @@ class RunCheckpoints:
 
         step: a number, "best", or the newest if not given.
         """
-        number = self._require_step(self.best_step if step == "best" else step)
+        number = self._require_step(self._number(step))
         flat = traverse_util.flatten_dict(like)
         stored = traverse_util.flatten_dict(_tree(self._manager.item_metadata(number)["trainable"]))
         frozen = {path: leaf for path, leaf in flat.items() if path not in stored} if self._base.exists() else {}
@@ -203,6 +223,21 @@ class RunCheckpoints:
         variables = traverse_util.flatten_dict(restored.arrays["trainable"])
         variables |= traverse_util.flatten_dict(self.restore_base(traverse_util.unflatten_dict(frozen)))
         return traverse_util.unflatten_dict(variables)
+
+    def identify(self, step: int | Literal["best"] | None = None) -> tuple[int, str]:
+        """The step that `restore_variables` restores, and a digest of all that it would read."""
+        number = self._require_step(self._number(step))
+        files = [self.folder / str(number) / DIGESTS, self._base / DIGESTS]
+        content = b"".join(file.read_bytes() for file in files if file.exists())
+        return number, hashlib.sha256(content).hexdigest()[:16]
+
+    def _number(self, step: int | Literal["best"] | None) -> int | None:
+        if step == "best" and self.best_step is None:
+            raise CheckpointError(
+                f"{self.folder}: no checkpoint was scored, so none is the best; name a step, or train with "
+                "--validate-every or --evaluate-every"
+            )
+        return self.best_step if step == "best" else step
 
     def list_variables(self) -> dict[tuple[str, ...], StoredVariable]:
         """Every variable of the newest step, trained or frozen, by its path; none is read."""
@@ -236,6 +271,8 @@ class RunCheckpoints:
         # Called in the background when all files of a step are written, before the folder gets its final name.
         if jax.process_index() == 0:
             for folder in self.folder.glob("*.orbax-checkpoint-tmp"):
+                for name in self._saving:
+                    _require_index(folder / name)
                 # Orbax goes on writing to the files at the top; they hold nothing that is restored.
                 write_digests(folder, top=False)
 
@@ -258,6 +295,12 @@ class RunCheckpoints:
             self.wait()
         finally:
             self._manager.close()
+
+
+def _require_index(item: Path) -> None:
+    """Raises CheckpointError if arrays were written without the index through which they are found."""
+    if not (item / ARRAY_INDEX).is_file():
+        raise CheckpointError(f"{item}: {ARRAY_INDEX} is missing, so its arrays could not be read")
 
 
 def _steps(folder: Path) -> list[int]:
@@ -341,4 +384,13 @@ def _tree(metadata: Any) -> Any:
 
 
 def _abstract(tree: Any) -> Any:
-    return jax.tree.map(ocp.utils.to_shape_dtype_struct, tree)
+    """What orbax is to restore: leaves without a sharding go to one device, whatever devices they were saved from."""
+    # Orbax would otherwise look for the devices that saved them.
+    here = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+
+    def abstract(leaf: Any) -> Any:
+        struct = ocp.utils.to_shape_dtype_struct(leaf)
+        lacks_sharding = isinstance(struct, jax.ShapeDtypeStruct) and struct.sharding is None
+        return struct.update(sharding=here) if lacks_sharding else struct
+
+    return jax.tree.map(abstract, tree)

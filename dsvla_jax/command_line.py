@@ -5,7 +5,7 @@ import ctypes
 import errno
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -32,6 +32,14 @@ def fail_with_message() -> Iterator[None]:
     except KeyboardInterrupt:
         print("stopped; nothing that was finished is lost", file=sys.stderr)
         sys.exit(130)
+
+
+def require_each_option_once(arguments: Sequence[str]) -> None:
+    """Raises UserError if an option is given twice: tyro would silently drop what was given first."""
+    names = [word.split("=")[0].replace("_", "-") for word in arguments if word.startswith("--")]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"{name} is given {names.count(name)} times; give it once, with all its values after it")
 
 
 def cache_folder() -> Path:

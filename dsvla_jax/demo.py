@@ -5,6 +5,7 @@ prompt, the answer with how probable each number was, and where the arm went.
 """
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import cv2
@@ -14,18 +15,19 @@ import numpy as np
 import tyro
 
 import dsvla_jax.policy
-from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.command_line import configure_jax, fail_with_message, require_each_option_once
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
 from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.policy import Decision, Policy
-from dsvla_jax.report import mark_targets, png_data, write_html
+from dsvla_jax.report import mark_targets, png_data, require_writable, write_html
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
-from dsvla_jax.training.experiment import load_experiment
+from dsvla_jax.training.experiment import load_experiment, require_simulated
 from dsvla_jax.types import Action, Observation
 
 SHOWN = 480  # pixels a side of a picture on the page
@@ -44,6 +46,10 @@ class Options:
     """Number of the episode, none of which was demonstrated."""
     out: Path | None = None
     """The page; RUN/demo.html if not given."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**31:
+            raise UserError(f"--seed: expected 0 to 2147483647, got {self.seed}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +126,12 @@ def main(options: Options) -> None:
     """Runs the episode and writes the page."""
     experiment = load_experiment(options.run / "config.json")
     data = experiment.data
-    (task,) = select_tasks((options.task,)) if options.task else select_tasks(data.tasks)[:1]
+    require_simulated(experiment, options.run)
+    task, *others = select_tasks((options.task,) if options.task else data.tasks[:1])
+    if options.task and others:
+        raise UserError(f"--task: expected one task, got {options.task!r}; the first of its tasks is {task}")
+    out = options.out or options.run / "demo.html"
+    require_writable(out.parent)
     policy, environment = dsvla_jax.policy.load(options.run), Environment(task, image_size=data.image_size)
     print(f"{task}, episode {options.seed}: compiling takes a minute the first time", flush=True)
     state = environment.reset(episode_keys(0, "eval", task, options.seed, 1))
@@ -134,7 +145,6 @@ def main(options: Options) -> None:
 
     find = keypoint_source(experiment.keypoints, environment)
     (ending,) = run_episodes(environment, act, state, find_keypoints=find(state) if find else None)
-    out = options.out or options.run / "demo.html"
     write_html(
         out,
         Path(__file__).with_name("demo.html.jinja"),
@@ -150,6 +160,7 @@ def main(options: Options) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
+        require_each_option_once(sys.argv[1:])
         parsed = tyro.cli(Options, prog="python -m dsvla_jax.demo", description=__doc__)
         configure_jax()
         main(parsed)

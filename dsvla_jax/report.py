@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import json
 import os
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import jinja2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
@@ -31,7 +33,8 @@ class EpisodeResult:
 
     seed: with ``task`` it names the episode: the same start under both kinds of physics. physics: "mujoco" or "mjx".
     reason: why it failed; empty on success. keyframes: key poses executed. actions: one entry a key pose, the text
-    that the policy answered.
+    that the policy answered. conditions: what else the outcome depends on, above all `step` and `digest` of the
+    checkpoint; empty in files of earlier versions.
     """
 
     task: str
@@ -42,6 +45,7 @@ class EpisodeResult:
     keyframes: int
     instruction: str
     actions: list[Any]
+    conditions: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +86,34 @@ def read_results(path: str | os.PathLike) -> list[EpisodeResult]:
     return results
 
 
+def merge_results(
+    earlier: Sequence[EpisodeResult], fresh: Sequence[EpisodeResult]
+) -> tuple[list[EpisodeResult], list[EpisodeResult]]:
+    """The earlier results with the fresh ones put in, and what they displace: by task, then by seed.
+
+    Tasks without fresh results stay as they are. Of the others, results under the same conditions stay unless their
+    episode was run again; those under other conditions are displaced. Fresh results of one task share conditions.
+    """
+    conditions = {result.task: result.conditions for result in fresh}
+    again = {(result.task, result.seed) for result in fresh}
+    displaced = [r for r in earlier if r.task in conditions and r.conditions != conditions[r.task]]
+    kept = [r for r in earlier if conditions.get(r.task, r.conditions) == r.conditions]
+    order = {task: place for place, task in enumerate(dict.fromkeys(r.task for r in (*earlier, *fresh)))}
+    merged = [*fresh, *(r for r in kept if (r.task, r.seed) not in again)]
+    return sorted(merged, key=lambda result: (order[result.task], result.seed)), displaced
+
+
+def checkpoints_of(results: Sequence[EpisodeResult]) -> str:
+    """For people: the step that the results are of, or which tasks are of which; empty if none is known."""
+    tasks: dict[tuple[Any, Any], dict[str, None]] = {}
+    for result in results:
+        key = (result.conditions.get("step"), result.conditions.get("digest"))
+        tasks.setdefault(key, {})[result.task] = None
+    if len(tasks) < 2:
+        return "".join(f"step {step}" for step, _ in tasks if step is not None)
+    return "; ".join(f"step {'unknown' if s is None else s}: {', '.join(names)}" for (s, _), names in tasks.items())
+
+
 def success_rates(results: Sequence[EpisodeResult]) -> list[SuccessRate]:
     """One rate a task, in the order in which the tasks first appear."""
     counts: dict[str, list[int]] = {}
@@ -106,8 +138,10 @@ def print_table(results: Sequence[EpisodeResult], console: Console | None = None
     """Success rates on the terminal."""
     rates = success_rates(results)
     physics = ", ".join(dict.fromkeys(result.physics for result in results))
-    table = Table(title=f"closed-loop success ({physics or 'no episodes'})")
-    table.add_column("task")
+    measured = ", ".join(part for part in (physics or "no episodes", checkpoints_of(results)) if part)
+    table = Table(title=f"closed-loop success ({measured})")
+    # Names are told apart by their ends, which would otherwise be cut off.
+    table.add_column("task", overflow="fold")
     for column in ("successes", "rate %", "95 % interval"):
         table.add_column(column, justify="right")
     for rate in rates:
@@ -122,9 +156,11 @@ def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Conso
     """Success rates of several runs side by side, a row a task that any of them has; results by the run's name."""
     rates = {name: {rate.name: rate for rate in success_rates(results)} for name, results in sets.items()}
     table = Table(title="closed-loop success, % (95 % interval)")
-    table.add_column("task")
-    for name in sets:
-        table.add_column(name, justify="right")
+    table.add_column("task", overflow="fold")
+    for name, results in sets.items():
+        checkpoints = checkpoints_of(results)
+        heading = f"{name}\n{checkpoints}" if checkpoints else name
+        table.add_column(Text(heading), justify="right", overflow="fold")
     for task in dict.fromkeys(task for of_run in rates.values() for task in of_run):
         cells = [_rate_cell(of_run.get(task)) for of_run in rates.values()]
         table.add_row(task, *cells)
@@ -196,8 +232,8 @@ def write_report(
 ) -> None:
     """The HTML report: rates with intervals, a row an episode with its film strip, and where physics differ.
 
-    strips: RGB frames uint8 (H, W, 3) by (task, seed); see `mark_targets`. other: results of the same episodes under
-    the other kind of physics. The page needs no other file and no network.
+    strips: RGB frames uint8 (H, W, 3) by (task, seed); see `mark_targets`. other: results under the other kind of
+    physics, compared where they are of the same episodes and checkpoint. The page needs no other file and no network.
     """
     rates = success_rates(results)
     write_html(
@@ -211,6 +247,7 @@ def write_report(
         episodes={rate.name: [result for result in results if result.task == rate.name] for rate in rates},
         pictures={key: png_data(film_strip(frames)) for key, frames in (strips or {}).items() if len(frames)},
         comparison=compare_physics(results, other) if other else None,
+        checkpoints=checkpoints_of(results),
     )
 
 
@@ -240,9 +277,13 @@ class Comparison:
 
 
 def compare_physics(first: Sequence[EpisodeResult], second: Sequence[EpisodeResult]) -> Comparison:
-    """Pairs the episodes of two sets by task and seed."""
-    partner = {(result.task, result.seed): result for result in second}
-    pairs = [(result, partner[key]) for result in first if (key := (result.task, result.seed)) in partner]
+    """Pairs the episodes of two sets by task, seed and checkpoint."""
+
+    def key(result: EpisodeResult) -> tuple[Any, ...]:
+        return result.task, result.seed, result.conditions.get("digest")
+
+    partner = {key(result): result for result in second}
+    pairs = [(result, partner[key(result)]) for result in first if key(result) in partner]
     tasks = []
     for task in dict.fromkeys(one.task for one, _ in pairs):
         outcomes = [(one.success, two.success) for one, two in pairs if one.task == task]
@@ -266,3 +307,13 @@ def write_whole(path: Path, text: str) -> None:
     temporary = path.with_name(path.name + ".partial")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
+
+
+def require_writable(folder: Path) -> None:
+    """Makes a folder if it is missing. Raises UserError if results could not be written to it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(2**16))
+    except OSError as error:
+        raise UserError(f"{folder}: cannot write here ({error.strerror}); choose another place with --out") from error

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from dsvla_jax.compile_times import first_use
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.errors import UserError
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
@@ -62,12 +63,17 @@ def run_task(
     """The first `episodes` of a split's stream of one task, `batch` of them side by side, with a progress bar.
 
     keypoint_noise: metres of uniform noise an axis on every keypoint.
+        Noise and paraphrase belong to an episode's number: the size of a batch changes neither.
     find_keypoints: makes what finds the keypoints of a batch from its reset state; the task's own if not given.
     label: for people, in place of the task's name.
     stop: asked after every key pose; raises Stopped where it says so.
+    Raises UserError for fewer than one episode, or fewer than one side by side.
     """
+    if episodes < 1 or batch < 1:
+        raise UserError(f"episodes and batch: expected at least 1 of each, got {episodes} and {batch}")
     name, size = environment.task.name, min(episodes, batch)
     endings: list[Ending] = []
+    random = np.random.default_rng([seed, 0])
     with tqdm(total=episodes, desc=label or name, unit="episode", leave=None) as bar:
 
         def told(done: int, succeeded: int) -> None:
@@ -82,10 +88,16 @@ def run_task(
             with compiling if start == 0 else contextlib.nullcontext():
                 state = environment.reset(keys)
                 keypoints = environment.keypoints(state)
-            noise = np.random.default_rng([seed, start]).uniform(-1, 1, keypoints.shape)
+            noise = random.uniform(-1, 1, keypoints.shape)
             found = None if find_keypoints is None else find_keypoints(state)
             endings += run_episodes(
-                environment, act, state, noise=noise * keypoint_noise, find_keypoints=found, on_keyframe=told
+                environment,
+                act,
+                state,
+                first=start,
+                noise=noise * keypoint_noise,
+                find_keypoints=found,
+                on_keyframe=told,
             )
             bar.update(min(size, episodes - start))
     return endings[:episodes]
@@ -96,6 +108,7 @@ def run_episodes(
     act: Act,
     state: SimState,
     limit: int | None = None,
+    first: int = 0,
     noise: np.ndarray | float = 0.0,
     find_keypoints: KeypointSource | None = None,
     on_keyframe: Callable[[int, int], None] = lambda done, succeeded: None,
@@ -103,13 +116,14 @@ def run_episodes(
     """Runs the episodes of a reset state to their ends, side by side.
 
     limit: key poses after which an episode is over; twice the expert's if not given.
+    first: the number of the first episode, which chooses the paraphrases of the instruction.
     noise: metres added to the keypoints, (B, A, K, 3) for the task's K or a number.
     find_keypoints: asked before every key pose; the task's own keypoints at the start if not given. An episode for
         which it has none is over.
     on_keyframe: told the number of key poses done and of successes so far.
     """
     batch = state.qpos.shape[0]
-    instructions = environment.instructions(state, np.arange(batch))
+    instructions = environment.instructions(state, np.arange(first, first + batch))
     own, no_problem = np.asarray(environment.keypoints(state)), [""] * batch
     noise = np.broadcast_to(noise, own.shape)
     latched = np.zeros(own.shape[:2], np.int32)

@@ -1,5 +1,9 @@
-"""Writes run folders with random weights, as train.py leaves them, without training."""
+"""Writes run folders with random weights, as train.py leaves them, without training.
 
+``python -m tests.run_folders FOLDER`` writes a run for each of `MESHES`, with all devices of its process.
+"""
+
+import sys
 import zlib
 from pathlib import Path
 from typing import Any
@@ -11,16 +15,24 @@ from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
-from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.config import LoraConfig, ModelConfig
+from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
+from dsvla_jax.training.sharding import MeshConfig, make_mesh
+from tests.small import small_language, small_vision
 
 TOKENIZER = WordTokenizer(vocabulary(["close the box", "stack 2 red blocks"]))
+MODEL = ModelConfig(small_vision(), small_language(TOKENIZER.vocab_size), lora=LoraConfig(rank=2))
+MESHES = {"data": MeshConfig(-1, 1, 1), "fsdp": MeshConfig(1, -1, 1)}
 
 
-def write_run(run: Path, model: ModelConfig, regime: str = "lora") -> dict[str, Any]:
-    """Writes a run of ``model`` and returns its variables: no zeros, no ones, adapters that do something.
+def write_run(
+    run: Path, model: ModelConfig, regime: str = "lora", mesh: jax.sharding.Mesh | None = None
+) -> dict[str, Any]:
+    """Writes a run of ``model``, split over ``mesh`` if given, and returns its variables: no zeros, no ones, adapters
+    that do something.
 
     Values are drawn from the variables' names, so runs with and without adapters have the same base.
     """
@@ -37,6 +49,8 @@ def write_run(run: Path, model: ModelConfig, regime: str = "lora") -> dict[str, 
         return np.asarray(noise + (name == "scale"), np.float32)
 
     variables = jax.tree_util.tree_map_with_path(fill, variables)
+    if mesh is not None:
+        variables = jax.device_put(variables, shardings(variables, mesh))
     trainable, frozen = split_variables(variables, regime)
     run.mkdir(parents=True)
     encoding = EncodingConfig(
@@ -51,3 +65,8 @@ def write_run(run: Path, model: ModelConfig, regime: str = "lora") -> dict[str, 
     checkpoints.save(1, {"trainable": trainable}, {})
     checkpoints.close()
     return variables
+
+
+if __name__ == "__main__":
+    for name, config in MESHES.items():
+        write_run(Path(sys.argv[1]) / name, MODEL, mesh=make_mesh(config))

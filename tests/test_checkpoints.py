@@ -206,3 +206,31 @@ def test_a_folder_that_is_gone_is_told(tmp_path: Path):
     told = pytest.raises(CheckpointError, match=r"could not be written .*there is no earlier one")
     with told, closing(checkpoints):
         checkpoints.save(1, arrays_of(state(0)), NOTES)
+
+
+@pytest.mark.parametrize("name", ["lr=[0.1]", "all*", "which?", "back\\slash"])
+def test_a_folder_whose_arrays_could_not_be_read_is_refused_before_anything_is_written(tmp_path: Path, name: str):
+    with pytest.raises(CheckpointError, match=r"whose path contains [\[*?\\]; choose another folder"):
+        RunCheckpoints(tmp_path / name / "run")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_was_moved_to_a_folder_with_brackets_is_read(tmp_path: Path):
+    save(tmp_path / "run", 1)
+    (tmp_path / "run").rename(tmp_path / "lr=[0.1]")
+    with closing(RunCheckpoints(tmp_path / "lr=[0.1]", read_only=True)) as checkpoints:
+        assert_same(checkpoints.restore_variables(jax.eval_shape(lambda: state(0).trainable)), state(1).trainable)
+
+
+def test_arrays_without_their_index_do_not_count_as_saved(tmp_path: Path, monkeypatch):
+    # In such a folder orbax leaves the index out without a word.
+    monkeypatch.setattr("dsvla_jax.checkpoints.PATTERN_CHARACTERS", "")
+    checkpoints = RunCheckpoints(tmp_path / "[1]")
+    with pytest.raises(CheckpointError, match=r"base: manifest.ocdbt is missing"):
+        checkpoints.save_base(variables(1))
+    with (
+        pytest.raises(CheckpointError, match=r"could not be written .*manifest.ocdbt is missing"),
+        closing(checkpoints),
+    ):
+        checkpoints.save(1, arrays_of(state(1)), NOTES)
+    assert not (tmp_path / "[1]" / "checkpoints" / "1").exists()

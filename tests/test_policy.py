@@ -1,6 +1,10 @@
 """A policy with the tokenizer of a language model: from observation to action, and through a run folder."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,6 +16,7 @@ from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import BATCH_SIZES, Policy, full_size, load, save_policy_config
 from dsvla_jax.types import Camera, Observation
+from tests.run_folders import MESHES, MODEL, write_run
 from tests.serving import PROMPTS, observation, tiny_policy
 from tests.vocabularies import small_tokenizer
 
@@ -65,3 +70,16 @@ def test_a_run_folder_keeps_the_tokenizer(policy, tmp_path):
     again = load(tmp_path)
     assert again.tokenizer == policy.tokenizer
     assert again.act(*batch(8))[1] == policy.act(*batch(8))[1]
+
+
+def test_a_run_trained_on_eight_devices_loads_on_one(tmp_path):
+    """Split by `data` and by `fsdp`, with adapters on a frozen base."""
+    devices = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    root = Path(__file__).parent.parent
+    command = [sys.executable, "-m", "tests.run_folders", str(tmp_path)]
+    subprocess.run(command, cwd=root, env={**os.environ, **devices}, check=True, timeout=300)
+    write_run(tmp_path / "one", MODEL)
+    expected = load(tmp_path / "one").variables
+    for name in MESHES:
+        assert (tmp_path / name / "base").exists()
+        jax.tree.map(np.testing.assert_array_equal, load(tmp_path / name).variables, expected)

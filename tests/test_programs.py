@@ -40,6 +40,7 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (["eval.py", "nowhere"], "no run here"),
         (["eval.py", "nowhere", "--compare", "elsewhere"], "no results here; evaluate first"),
         (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
+        (["train.py", "tiny", "--run", "runs/lr=[0.1]"], "whose path contains [; choose another folder"),
         (["train.py", "tiny", "--run", "/dev/null/run"], "error: /dev/null/run: Not a directory; choose another path"),
         (["-m", "data_pipelines.oxe", "fixtures", "/dev/null", "--datasets", "viola"], "error: /dev/null/viola"),
     ],

@@ -1,6 +1,8 @@
 import base64
+import dataclasses
 import html.parser
 import io
+import json
 import re
 
 import cv2
@@ -14,10 +16,12 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import front_camera, project
 from dsvla_jax.report import (
     EpisodeResult,
+    checkpoints_of,
     compare_physics,
     film_strip,
     macro_mean,
     mark_targets,
+    merge_results,
     print_comparison,
     print_table,
     read_results,
@@ -168,3 +172,55 @@ def test_runs_are_compared_on_the_tasks_that_all_have():
     assert re.search(r"lamp_on\D+75\.0 \(30 to 95\)\D+100\.0 \(51 to 100\)", text)
     assert re.search(r"lift_ball\D+0\.0 \(0 to 79\)\D+-", text)
     assert re.search(r"mean of the 1 tasks that all have\D+75\.0\D+100\.0", text)
+
+
+@pytest.mark.parametrize("width", [60, 100])
+def test_names_of_runs_and_tasks_are_told_apart_on_a_narrow_terminal(width: int):
+    names = [f"runs/paper_7b_finetuned_with_keypoints_and_shifted_worlds_{end}[bold]" for end in ("one", "two")]
+    task = "take_umbrella_out_of_umbrella_stand_and_open_it_over_the_table"
+    console = Console(record=True, width=width, file=io.StringIO())
+    print_comparison({name: [result(task, 0, True)] for name in names}, console)
+    print_table([result(task, 0, True)], console)
+    text = console.export_text()
+    assert "…" not in text
+    rows = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in text.splitlines()]
+    columns = zip(*(row for row in rows if len(row) == 3), strict=True)
+    whole = ["".join(column) for column in columns]
+    for name, column in zip(names, whole[1:], strict=True):
+        assert name in column
+    assert task in whole[0]
+
+
+AT_ONE, AT_TWO = {"step": 1, "digest": "a"}, {"step": 2, "digest": "b"}
+
+
+def test_results_of_other_tasks_and_further_episodes_stay():
+    earlier = [result(task, seed, True, conditions=AT_ONE) for task in ("lamp_on", "close_box") for seed in range(3)]
+    fresh = [result("lamp_on", 0, False, conditions=AT_ONE), result("lift_ball", 0, True, conditions=AT_ONE)]
+    merged, displaced = merge_results(earlier, fresh)
+    assert merged == [fresh[0], *earlier[1:], fresh[1]]
+    assert displaced == []
+
+
+def test_results_of_another_checkpoint_are_displaced_task_by_task():
+    without = [result("lamp_on", seed, True) for seed in range(3)]
+    others = [result("close_box", 0, True, conditions=AT_ONE)]
+    fresh = [result("lamp_on", 0, False, conditions=AT_TWO)]
+    merged, displaced = merge_results([*without, *others], fresh)
+    assert (merged, displaced) == ([*fresh, *others], without)
+    assert checkpoints_of(merged) == "step 2: lamp_on; step 1: close_box"
+    assert checkpoints_of(fresh) == "step 2"
+    assert checkpoints_of(without) == ""
+
+
+def test_physics_are_compared_on_the_same_checkpoint_only():
+    one = [result("lamp_on", 0, True, conditions=AT_ONE)]
+    assert compare_physics(one, [result("lamp_on", 0, False, "mjx", conditions=AT_TWO)]).tasks == []
+    assert len(compare_physics(one, [result("lamp_on", 0, False, "mjx", conditions=AT_ONE)]).differing) == 1
+
+
+def test_results_of_earlier_versions_are_read(tmp_path):
+    row = dataclasses.asdict(RESULTS[0])
+    del row["conditions"]
+    (tmp_path / "mujoco.jsonl").write_text(json.dumps(row) + "\n")
+    assert read_results(tmp_path / "mujoco.jsonl") == RESULTS[:1]

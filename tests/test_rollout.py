@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dsvla_jax.errors import UserError
 from dsvla_jax.rollout import Stopped, run_episodes, run_task
 from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.sim.episode import Environment
@@ -64,6 +65,33 @@ def test_a_task_is_run_in_batches_from_the_seeds_of_its_split():
     # The plans are those of these seeds in this order: from other starts they would not succeed.
     assert [ending.success for ending in endings] == [True] * 3
     assert calls == [2] * (2 * poses.shape[1]), "the last batch is filled up"
+
+
+def test_an_episode_is_the_same_whatever_the_size_of_the_batch():
+    """Its paraphrase, and the noise on its keypoints."""
+
+    lamp = environment("lamp_on")
+
+    def asked(batch: int) -> list[tuple[str, np.ndarray]]:
+        calls = []
+
+        def act(observation, instructions, keypoints):
+            calls.append(list(zip(instructions, keypoints, strict=True)))
+            return Action(jnp.asarray(observation.pose), jnp.asarray(observation.gripper_open)), [""] * batch
+
+        run_task(lamp, act, EPISODES, split="validation", batch=batch, keypoint_noise=0.1)
+        return [turn for call in calls[:: 2 * lamp.expert_keyframes] for turn in call]
+
+    assert len({instruction for instruction, _ in asked(2)}) > 2
+    for (one, near), (other, likewise) in zip(asked(2), asked(EPISODES), strict=True):
+        assert one == other
+        np.testing.assert_array_equal(near, likewise)
+
+
+def test_no_episodes_are_no_evaluation():
+    for episodes, batch in ((0, 2), (2, 0), (2, -3)):
+        with pytest.raises(UserError, match="expected at least 1 of each"):
+            run_task(environment("lamp_on"), follow(plan_of("lamp_on")), episodes, split="validation", batch=batch)
 
 
 def test_episodes_are_given_up_after_a_key_pose():

@@ -152,3 +152,12 @@ def load_experiment(path: Path) -> Experiment:
     except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
         details = "; ".join(cattrs.transform_error(error)) if isinstance(error, cattrs.BaseValidationError) else error
         raise UserError(f"{path}: not an experiment of this version: {details}") from error
+
+
+def require_simulated(experiment: Experiment, run: Path) -> None:
+    """Raises UserError for a run whose policy cannot act in the simulator."""
+    if experiment.oxe is not None:
+        raise UserError(
+            f"{run}: learned from Open X-Embodiment, so its answers are poses in each robot's own frame, not in the "
+            f"simulator's; finetune it on simulated tasks first: python train.py CONFIG --base {run}"
+        )

@@ -18,7 +18,7 @@ import tensorstore as ts
 from flax import traverse_util
 from jax.sharding import SingleDeviceSharding
 
-from dsvla_jax.checkpoints import CheckpointError, require_same_shapes
+from dsvla_jax.checkpoints import SEPARATOR, CheckpointError, require_same_shapes, require_writable_path
 
 DESCRIPTION, PARAMS = "description.json", "params"
 # Numbers along each of a chunk's two sides, 8 MB of bfloat16. Whoever needs a part of a chunk reads all of it.
@@ -53,6 +53,7 @@ def create_weights(
     leaves: by path ("language/layers/q/kernel"). Yields an array on disk for each: ``arrays[path][index] = values``
     writes.
     """
+    require_writable_path(folder, SEPARATOR)
     with new_folder(folder) as partial:
         # Orbax writes the tree, with one number in each array; the arrays are then made anew in their real sizes.
         tree = traverse_util.unflatten_dict(

@@ -34,12 +34,17 @@ def get_task(name: str) -> Task:
 
 
 def select_tasks(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of tasks, with ``all``, ``single_arm`` and ``dual_arm`` and lists with commas spelled out, none twice."""
+    """Names of tasks, with ``all``, ``single_arm`` and ``dual_arm`` and lists with commas spelled out, none twice.
+
+    Raises UserError for an unknown name, or if there is none.
+    """
     groups = {
         "all": tuple(TASKS),
         "single_arm": tuple(name for name, task in TASKS.items() if task.num_arms == 1),
         "dual_arm": tuple(name for name, task in TASKS.items() if task.num_arms == 2),
     }
     words = [word for name in names for word in name.split(",") if word]
+    if not words:
+        raise UserError(f"tasks: expected at least one name, got {' '.join(names)!r}; the tasks are {', '.join(TASKS)}")
     chosen = [name for word in words for name in groups.get(word, (word,))]
     return tuple(get_task(name).name for name in dict.fromkeys(chosen))

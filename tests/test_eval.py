@@ -1,0 +1,197 @@
+"""eval.py: what it keeps of earlier results, what it skips, and what it refuses before an episode is run."""
+
+import dataclasses
+import shutil
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+
+import eval as program
+from data_pipelines.samples import suite_tokenizer
+from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.command_line import require_each_option_once
+from dsvla_jax.data_config import DataConfig, OxeConfig
+from dsvla_jax.demo import Options as DemoOptions
+from dsvla_jax.demo import main as demo
+from dsvla_jax.errors import UserError
+from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.vla import initialize
+from dsvla_jax.policy import PolicyConfig, save_policy_config
+from dsvla_jax.report import EpisodeResult, read_results, write_results
+from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.training.experiment import Experiment, save_experiment
+from tests.small import small_encoding, small_language, small_vision
+
+TOKENIZER = suite_tokenizer()
+EXPERIMENT = Experiment(
+    small_encoding(max_text_length=64),
+    ModelConfig(small_vision(), small_language(TOKENIZER.vocab_size)),
+    data=DataConfig(tasks=("lamp_on",), image_size=32, keypoints="oracle"),
+)
+# Rows as files of earlier versions have them, without conditions.
+OLD = [EpisodeResult(task, i, "mujoco", True, "", 2, "go", ["1"]) for task in ("lamp_on", "close_box") for i in (0, 1)]
+
+
+INITIALIZE = jax.jit(lambda: initialize(EXPERIMENT.model, jax.random.key(0)))
+
+
+def save(run: Path, *steps: int) -> None:
+    with closing(RunCheckpoints(run)) as checkpoints:
+        for step in steps:
+            checkpoints.save(step, {"trainable": INITIALIZE()}, {})
+
+
+def write_run(run: Path, experiment: Experiment = EXPERIMENT) -> Path:
+    """A run without checkpoints."""
+    run.mkdir(parents=True)
+    save_experiment(run / "config.json", experiment)
+    save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model), TOKENIZER)
+    return run
+
+
+def evaluate(run: Path, **options: Any) -> list[EpisodeResult]:
+    program.main(program.Options(run, batch=1, **options))
+    return read_results(run / "eval" / "mujoco.jsonl")
+
+
+def counts(results: list[EpisodeResult]) -> dict[tuple[str, Any], int]:
+    """Episodes by task and step of the checkpoint."""
+    keys = [(result.task, result.conditions.get("step")) for result in results]
+    return {key: keys.count(key) for key in keys}
+
+
+def test_an_evaluation_replaces_the_results_of_its_task_alone_and_destroys_none(tmp_path: Path, capsys):
+    run = write_run(tmp_path / "run")
+    save(run, 1)
+    file = run / "eval" / "mujoco.jsonl"
+    write_results(file, OLD)
+    results = evaluate(run, tasks=("lamp_on",), episodes=2)
+    assert counts(results) == {("lamp_on", 1): 2, ("close_box", None): 2}
+    assert read_results(run / "eval" / "mujoco-step-unknown.jsonl") == OLD[:2]
+    assert results[0].conditions["digest"]
+    assert {name: value for name, value in results[0].conditions.items() if name != "digest"} == {
+        "step": 1,
+        "physics": "mujoco",
+        "keypoints": "oracle",
+        "keypoint_noise": 0.0,
+        "shifts": [],
+        "seed": 0,
+        "choice": "greedy",
+        "image_size": 32,
+    }
+
+    # File times say nothing: the results are older than what follows, and of this checkpoint.
+    (run / "metrics.jsonl").write_text("")
+    before = file.read_bytes()
+    capsys.readouterr()
+    evaluate(run, episodes=2, skip_finished=True)
+    assert "holds 2 episodes of each task at step 1: nothing to do" in capsys.readouterr().out
+    assert file.read_bytes() == before
+
+    save(run, 2)
+    results = evaluate(run, episodes=2, skip_finished=True)
+    assert counts(results) == {("lamp_on", 2): 2, ("close_box", None): 2}
+    assert counts(read_results(run / "eval" / "mujoco-step-1.jsonl")) == {("lamp_on", 1): 2}
+    assert (run / "eval" / "mujoco-step-1" / "lamp_on-1.png").exists()
+
+
+def test_a_checkpoint_of_the_same_step_and_other_weights_is_another(tmp_path: Path):
+    save(tmp_path / "one", 1)
+    save(tmp_path / "other", 1)
+    shutil.copytree(tmp_path / "one", tmp_path / "copy")
+    identities = []
+    for name in ("one", "copy", "other"):
+        with closing(RunCheckpoints(tmp_path / name, read_only=True)) as checkpoints:
+            identities.append(checkpoints.identify())
+            with pytest.raises(CheckpointError, match="no checkpoint was scored"):
+                checkpoints.identify("best")
+    assert identities[0] == identities[1] != identities[2]
+    assert [step for step, _ in identities] == [1, 1, 1]
+
+
+def test_what_is_evaluated_in_the_place_of_a_damaged_step_is_in_the_results(tmp_path: Path):
+    save(tmp_path, 1, 2)
+    with closing(RunCheckpoints(tmp_path, read_only=True)) as checkpoints:
+        older, newer = checkpoints.identify(1), checkpoints.identify()
+    assert (older[0], newer[0]) == (1, 2)
+    files = [path for path in (tmp_path / "checkpoints" / "2" / "trainable").rglob("*") if path.is_file()]
+    largest = max(files, key=lambda path: path.stat().st_size)
+    largest.write_bytes(b"")
+    with closing(RunCheckpoints(tmp_path, read_only=True)) as checkpoints:
+        assert checkpoints.identify() == older
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_an_episode_is_run(tmp_path: Path, capsys):
+    run = write_run(tmp_path / "run")
+    save(run, 1)
+    (run / "eval").write_text("a file")
+    with pytest.raises(UserError, match=r"eval: cannot write here .*; choose another place with --out"):
+        program.main(program.Options(run, episodes=1))
+    assert "key pose" not in capsys.readouterr().err
+
+
+def test_results_written_elsewhere_are_compared(tmp_path: Path, capsys):
+    write_results(tmp_path / "elsewhere" / "mujoco.jsonl", OLD[:1])
+    write_results(tmp_path / "other" / "eval" / "mujoco.jsonl", OLD[2:3])
+    program.main(program.Options(tmp_path / "run", out=tmp_path / "elsewhere", compare=(tmp_path / "other",)))
+    printed = capsys.readouterr().out
+    assert "lamp_on" in printed
+    assert "close_box" in printed
+
+
+@pytest.mark.parametrize("main", [lambda run: program.main(program.Options(run)), lambda run: demo(DemoOptions(run))])
+def test_a_run_of_open_x_embodiment_does_not_act_in_the_simulator(tmp_path: Path, main):
+    experiment = dataclasses.replace(EXPERIMENT, oxe=OxeConfig(folder="data", mixture=("viola",)))
+    run = write_run(tmp_path / "run", experiment)
+    with pytest.raises(UserError, match=r"poses in each robot's own frame.*finetune it on simulated tasks first"):
+        main(run)
+    assert not (run / "eval").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"episodes": 0}, "--episodes: expected at least 1, got 0"),
+        ({"episodes": -3}, "--episodes: expected at least 1, got -3"),
+        ({"batch": 0}, "--batch: expected at least 1, got 0"),
+        ({"batch": -3}, "--batch: expected at least 1, got -3"),
+        ({"keypoint_noise": -1.0}, "--keypoint-noise: expected metres, 0 or more, got -1.0"),
+        ({"keypoint_noise": float("nan")}, "--keypoint-noise: .* got nan"),
+        ({"keypoint_noise": float("inf")}, "--keypoint-noise: .* got inf"),
+        ({"seed": -1}, "--seed: expected 0 to 2147483647, got -1"),
+        ({"seed": 2**40}, "--seed: "),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict[str, Any], expected: str):
+    with pytest.raises(UserError, match=expected):
+        program.Options(Path("run"), **options)
+
+
+def test_the_demo_wants_one_task_and_an_episode_that_exists(tmp_path: Path):
+    with pytest.raises(UserError, match="--seed: expected 0 to"):
+        DemoOptions(tmp_path, seed=-1)
+    run = write_run(tmp_path / "run")
+    for task in ("lamp_on,close_box", "all"):
+        with pytest.raises(UserError, match="--task: expected one task"):
+            demo(DemoOptions(run, task=task))
+    with pytest.raises(UserError, match="tasks: expected at least one name"):
+        demo(DemoOptions(run, task=","))
+
+
+def test_names_of_tasks_that_name_none_are_refused():
+    for names in ((",",), ("",), ()):
+        with pytest.raises(UserError, match="tasks: expected at least one name"):
+            select_tasks(names)
+    assert select_tasks(("lamp_on,lamp_on", "lamp_on")) == ("lamp_on",)
+
+
+def test_an_option_given_twice_is_refused_instead_of_dropped():
+    require_each_option_once(["run", "--tasks", "lamp_on", "--episodes", "2"])
+    for again in (["--tasks", "close_box"], ["--tasks=close_box"]):
+        with pytest.raises(UserError, match="--tasks is given 2 times; give it once, with all its values after it"):
+            require_each_option_once(["run", "--tasks", "lamp_on", *again])
+    with pytest.raises(UserError, match="--keypoint-noise is given 2 times"):
+        require_each_option_once(["run", "--keypoint_noise", "1", "--keypoint-noise", "2"])
