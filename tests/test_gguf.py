@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dsvla_jax.model.config import LanguageConfig
 from dsvla_jax.weights.sources import read_language
 from dsvla_jax.weights.tensors import WeightsError
 
@@ -77,6 +78,16 @@ def test_an_absent_output_is_the_embedding(tmp_path):
     model = draw_model()
     del model["output"]
     assert read_language(write_gguf(tmp_path / "model.gguf", model, "F32")).config.tie_embeddings
+
+
+def test_a_stored_output_is_used_even_if_it_is_the_embedding(tmp_path):
+    """The format has no word on tied tables: llama.cpp takes the output's where there is one."""
+    model = draw_model()
+    model["output"] = model["token_embd"]
+    tower = read_language(write_gguf(tmp_path / "model.gguf", model, "F32"))
+    assert isinstance(tower.config, LanguageConfig)
+    assert not tower.config.tie_embeddings
+    np.testing.assert_array_equal(tower.load()["output"], model["output"].T)
 
 
 def without(name):

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from dsvla_jax.model.clip import VisionTower
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, RopeScaling, VisionConfig
@@ -117,6 +118,27 @@ def test_hidden_states_and_logits_of_llama(tmp_path, name):
     actual = our_language(ModelConfig(language=tower.config), {"params": tower.load()}, batch)
     for ours, oracle in zip(actual, expected, strict=True):
         assert_close(np.asarray(ours)[batch["mask"]], oracle[batch["mask"]])
+
+
+@pytest.mark.parametrize("stored", ["table", "head", "equal", "different"])
+def test_logits_of_tied_llamas_however_they_are_stored(tmp_path, stored):
+    """Tied by config.json: with the table, the head, both alike, or a head of its own, which transformers 5 uses."""
+    config = transformers.LlamaConfig(**LANGUAGES["grouped_tied"], num_hidden_layers=2)
+    fill(transformers.LlamaForCausalLM(config)).save_pretrained(tmp_path)
+    file, head = tmp_path / "model.safetensors", "lm_head.weight"
+    tensors = load_file(file)
+    table = tensors["model.embed_tokens.weight"]
+    if stored == "head":
+        del tensors["model.embed_tokens.weight"]
+    if stored != "table":
+        tensors[head] = table[::-1].copy() if stored == "different" else table
+    save_file(tensors, file, metadata={"format": "pt"})
+    tower, batch = read_language(tmp_path), padded_batch(config.vocab_size, 13)
+    assert isinstance(tower.config, LanguageConfig)
+    assert tower.config.tie_embeddings == (stored != "different")
+    _, expected = their_language(transformers.LlamaForCausalLM.from_pretrained(tmp_path).eval(), batch)
+    _, actual = our_language(ModelConfig(language=tower.config), {"params": tower.load()}, batch)
+    assert_close(np.asarray(actual)[batch["mask"]], expected[batch["mask"]], 1e-5)
 
 
 @pytest.mark.parametrize("name", VISIONS)

@@ -114,14 +114,82 @@ def test_left_out_fields_have_the_defaults_of_the_architecture(tmp_path):
         read_language(folder)  # the config is LLaMA-7B's, and only then are files looked for
 
 
-def test_saved_buffers_and_the_copy_of_a_tied_table_are_left_alone(tmp_path):
+EMBEDDING, HEAD = "model.embed_tokens.weight", "lm_head.weight"
+
+
+def read_tied(tmp_path, tensors):
+    """A checkpoint whose config.json says tie_word_embeddings."""
+    return read_language(write_checkpoint(tmp_path / "source", CASES["grouped_tied"]["config"], tensors))
+
+
+def test_the_copy_of_a_tied_table_is_kept_once(tmp_path):
     tensors = case_tensors("grouped_tied")
-    extra = {
-        "lm_head.weight": tensors["model.embed_tokens.weight"],
-        "model.layers.0.self_attn.rotary_emb.inv_freq": np.zeros(3, np.float32),
-    }
-    folder = write_checkpoint(tmp_path / "source", CASES["grouped_tied"]["config"], tensors | extra)
-    assert set(read_language(folder).unused) == set(extra)
+    tower = read_tied(tmp_path, tensors | {HEAD: tensors[EMBEDDING]})
+    assert isinstance(tower.config, LanguageConfig)
+    assert tower.config.tie_embeddings
+    assert tower.unused == (HEAD,)
+    assert tower.notes == (f"{HEAD} equals {EMBEDDING}: tied, and kept once",)
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_a_head_of_its_own_is_used_whatever_the_config_says(tmp_path, row):
+    """As transformers 5 does it, which says so in a warning."""
+    tensors = case_tensors("grouped_tied")
+    head = tensors[EMBEDDING].copy()
+    head[row, 0] += 0.001
+    tower = read_tied(tmp_path, tensors | {HEAD: head})
+    assert isinstance(tower.config, LanguageConfig)
+    assert not tower.config.tie_embeddings
+    np.testing.assert_array_equal(tower.load()["output"], head.T)
+    assert "differs from model.embed_tokens.weight" in tower.notes[0]
+    assert not tower.unused
+
+
+def test_a_tied_table_may_be_stored_as_the_head_alone(tmp_path):
+    tensors = case_tensors("grouped_tied")
+    table = tensors.pop(EMBEDDING)
+    tower = read_tied(tmp_path, tensors | {HEAD: table})
+    assert isinstance(tower.config, LanguageConfig)
+    assert tower.config.tie_embeddings
+    np.testing.assert_array_equal(tower.load()["embedding"], table)
+
+
+def test_a_head_far_outside_of_its_decoder_is_found(tmp_path):
+    """Where multimodal models of transformers 5 have it."""
+    tensors = case_tensors("plain")
+    renamed = {key.replace("model.", "model.language_model."): value for key, value in tensors.items()}
+    params = read_language(write_checkpoint(tmp_path / "source", CASES["plain"]["config"], renamed)).load()
+    np.testing.assert_array_equal(params["output"], tensors[HEAD].T)
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"other.lm_head.weight": np.zeros((53, 42), np.float32)}, "other.lm_head.weight: of another model than the"),
+        ({"lm_head.bias": np.zeros(53, np.float32)}, "no place in this architecture for: lm_head.bias"),
+        ({HEAD: np.zeros((54, 42), np.float32)}, r"lm_head.weight: expected shape \(53, 42\) by its sizes, found"),
+    ],
+)
+def test_heads_that_do_not_fit_are_refused_of_tied_models_too(tmp_path, extra, message):
+    with pytest.raises(WeightsError, match=message):
+        read_tied(tmp_path, case_tensors("grouped_tied") | extra)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float16, jnp.bfloat16])
+def test_saved_constants_are_compared_before_they_are_left_alone(tmp_path, dtype):
+    key = "model.layers.0.self_attn.rotary_emb.inv_freq"
+    frequencies = 10000.0 ** -(np.arange(3) / 3)
+    for name, values, notes in (("same", frequencies, 0), ("other", 2 * frequencies, 1)):
+        tower = read_tied(tmp_path / name, case_tensors("grouped_tied") | {key: values.astype(dtype)})
+        assert tower.unused == (key,)
+        assert len(tower.notes) == notes
+    assert key in tower.notes[0]
+    key, positions = "embeddings.position_ids", np.arange(10)[None]
+    for name, values, notes in (("same", positions, 0), ("other", positions[:, ::-1].copy(), 1)):
+        tensors = case_tensors("odd_grid") | {key: values}
+        tower = read_vision(write_checkpoint(tmp_path / name / "clip", CASES["odd_grid"]["config"], tensors))
+        assert tower.unused == (key,)
+        assert len(tower.notes) == notes
 
 
 def test_missing_and_surplus_tensors_are_all_named(tmp_path):

@@ -56,6 +56,8 @@ def import_command(
     )
     for name, tower in towers.items():
         print(f"{name}: {tower.size:,} parameters, {tower.config}")
+        for note in tower.notes:
+            print(f"{name}: {note}")
         if tower.unused:
             print(f"{name}: left alone: {summarize(tower.unused)}")
     print(f"written: {out}")

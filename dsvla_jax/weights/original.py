@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dsvla_jax.model.config import LanguageConfig, RopeScaling, VisionConfig
+from dsvla_jax.model.llama import rotary_frequencies
 from dsvla_jax.weights.configs import Section
 from dsvla_jax.weights.safetensors import read_json
 from dsvla_jax.weights.tensors import StoredTensor, WeightsError
@@ -17,6 +18,8 @@ from dsvla_jax.weights.torch_files import list_tensors
 from dsvla_jax.weights.towers import AXES, Tower, assign, find_prefix, tower_shapes
 
 PARAMS = "params.json"
+# A constant that Meta's files have beside the parameters, and that Meta's code does not read.
+FREQUENCIES = "rope.freqs"
 
 META_LINEAR = {
     **{name: f"attention.w{name}" for name in "qkvo"},
@@ -79,7 +82,12 @@ def read_meta_language(folder: Path) -> Tower:
     tensors = list_tensors(files[0])
     config = _meta_config(Section(folder / PARAMS, read_json(folder / PARAMS)), tensors, files[0])
     tensors = in_rotary_pairs(tensors, config.head_dim)
-    return assign(config, tower_shapes(config), META_NAMES, tensors, files[0], droppable=("rope.freqs",))
+    notes = ()
+    unscaled = dataclasses.replace(config, rope_scaling=None)
+    if FREQUENCIES in tensors and not tensors[FREQUENCIES].holds(rotary_frequencies(unscaled)):
+        notes = (f"{FREQUENCIES} differs from what {PARAMS} says, which alone is used, as in Meta's code",)
+    shapes = tower_shapes(config)
+    return assign(config, shapes, META_NAMES, tensors, files[0], droppable=(FREQUENCIES,), notes=notes)
 
 
 def in_rotary_pairs(tensors: Mapping[str, StoredTensor], head_dim: int) -> dict[str, StoredTensor]:
@@ -128,7 +136,7 @@ def read_openai_vision(file: Path, projection: bool = False) -> Tower:
     if not projection:
         config = dataclasses.replace(config, embed_width=None)
     names = {ours: prefix + theirs for ours, theirs in CLIP_NAMES.items()}
-    droppable = () if projection else (CLIP_NAMES["projection"],)
+    droppable = () if projection else (names["projection"],)
     return assign(
         config,
         tower_shapes(config),

@@ -9,8 +9,10 @@ import numpy as np
 
 from dsvla_jax.errors import UserError
 
+INTEGERS = {"I64": np.dtype(np.int64), "I32": np.dtype(np.int32)}
 FLOATS = {"F32": np.dtype(np.float32), "F16": np.dtype(np.float16), "BF16": np.dtype(jnp.bfloat16)}
 AGAIN = "download it again"
+COMPARED_ROWS = 1024
 
 
 class WeightsError(UserError):
@@ -62,6 +64,26 @@ class StoredTensor:
 
     def _decode(self, content: np.ndarray) -> np.ndarray:
         return content.view(FLOATS[self.dtype])
+
+    def equals(self, other: "StoredTensor") -> bool:
+        """Whether another tensor holds the same numbers."""
+        if self.shape != other.shape or not self.shape:
+            return False
+        for start in range(0, self.shape[0], COMPARED_ROWS):
+            stop = min(start + COMPARED_ROWS, self.shape[0])
+            one, two = (tensor.read(start, stop).astype(np.float32) for tensor in (self, other))
+            if not np.array_equal(one, two):
+                return False
+        return True
+
+    def holds(self, constant: np.ndarray) -> bool:
+        """Whether it holds these numbers, but for the rounding of 16-bit floats; leading axes of length 1 are free."""
+        dtype = (FLOATS | INTEGERS).get(self.dtype)
+        shape = self.shape[max(len(self.shape) - constant.ndim, 0) :]
+        if dtype is None or shape != constant.shape or self.end - self.begin != constant.size * dtype.itemsize:
+            return False
+        stored = np.fromfile(self.file, dtype, constant.size, offset=self.begin)
+        return np.allclose(stored.astype(np.float64).reshape(shape), constant, rtol=2**-7, atol=2**-24)
 
     def rows(self, start: int, stop: int) -> "StoredTensor":
         """The part between two rows of the first axis."""

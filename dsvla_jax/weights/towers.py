@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +61,15 @@ class Tower:
     """Parameters whose tensors are all there, and not read yet.
 
     config: sizes, for the vision tower and the language model. shapes: by path, layers stacked. computed: parameters
-    that are not as they are stored, float32. unused: keys of the checkpoint left alone.
+    that are not as they are stored, float32. unused: keys of the checkpoint left alone. notes: what the tensors say
+    otherwise than the checkpoint's config, and what is done about it.
     """
 
     config: Any
     shapes: Mapping[str, tuple[int, ...]]
     pieces: tuple[Piece, ...]
     unused: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     computed: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
@@ -112,23 +114,24 @@ def assign(
     tensors: Mapping[str, StoredTensor],
     source: Path,
     *,
-    prefix: str = "",
-    droppable: tuple[str, ...] = (),
+    prefix: str | tuple[str, ...] = "",
+    droppable: Collection[str] = (),
+    notes: tuple[str, ...] = (),
     axes: Mapping[str, tuple[int, ...]] = AXES,
 ) -> Tower:
     """The tower of ``config`` with parameters of ``shapes``. Every tensor is checked, and none is read.
 
-    names: the checkpoint's name of each parameter, with {} where the number of the layer stands. prefix: what all
-    tensors of this tower are named with; one that has no place is an error, unless its name ends as one of
-    ``droppable``. axes: which of the stored axes becomes each of ours, by the last part of a path, where that is
-    another one.
+    names: the checkpoint's name of each parameter, with {} where the number of the layer stands. prefix: what the names
+    of this tower's tensors begin with (any one of several); one that has no place is an error, unless ``droppable`` has
+    its name. notes: the tower's. axes: which of the stored axes becomes each of ours, by the last part of a path, where
+    that is another one.
     Raises WeightsError naming files and keys.
     """
     keys = {place: names[place[0]].format(place[1]) for place in _places(shapes)}
     used = set(keys.values())
     missing = [key for key in used if key not in tensors]
     unused = tuple(key for key in tensors if key not in used)
-    strange = [key for key in unused if key.startswith(prefix) and not key.endswith(droppable)]
+    strange = [key for key in unused if key.startswith(prefix) and key not in droppable]
     if missing or strange:
         problems = [
             f"{label} {summarize(found)}"
@@ -137,7 +140,7 @@ def assign(
         ]
         raise WeightsError(f"{source}: its tensors do not fit its sizes: {'; '.join(problems)}")
     pieces = tuple(_piece(place, tensors[key], shapes, axes) for place, key in keys.items())
-    return Tower(config, shapes, pieces, unused)
+    return Tower(config, shapes, pieces, unused, notes)
 
 
 def _places(shapes: Mapping[str, tuple[int, ...]]) -> Iterator[Place]:
