@@ -14,12 +14,12 @@ from data_pipelines.inspect.motions import COMPONENTS, draw_motion, motion_stati
 from data_pipelines.inspect.page import Page, Section, Table
 from data_pipelines.inspect.stored import describe_stored, feature_table, shard_table
 from data_pipelines.oxe.dataset import OxeDataset
-from data_pipelines.oxe.index import main_view
+from data_pipelines.oxe.index import HIGH, LOW, main_view
 from data_pipelines.oxe.mixture import EncodedSample, OpenDataset, folder_of, open_mixture, shares_of
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import DATASETS, get_dataset
 from data_pipelines.oxe.samples import prompts_and_answers, write_picture
-from data_pipelines.oxe.scale import HIGH, LOW, MixtureScale
+from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.oxe.targets import why_unsupported
 from data_pipelines.records import Frame
 from data_pipelines.rlds import files
@@ -220,8 +220,12 @@ def _warnings(
         found.append("positions are in units that are not known: displacements are stretched to the mixture's range")
     if all((motion.gripper_command == motion.gripper_command[0]).all() for motion in motions):
         found.append("no gripper ever changes")
-    if not all(motion.instruction for motion in motions):
-        found.append("some episodes have no instruction")
+    if count := opened.index.unlabelled:
+        left_out = opened.config.unlabelled == "leave_out"
+        use = "left out" if left_out else "learned from with prompts that ask for nothing"
+        found.append(f"{count:,} of {opened.num_episodes:,} episodes have no instruction: they are {use}")
+    if still := [name for name in opened.index.constant if name != "gripper"]:
+        found.append(f"{', '.join(still)} of the targets do not vary: every answer says the same of them")
     for frame in clouds:
         box = (encoding.workspace_low, encoding.workspace_high)
         _, valid = cloud_from_depth(frame["depth"], camera_of(frame), *box, encoding.stride)
