@@ -231,6 +231,12 @@ class EpisodeReader:
         (record,) = self._open[shard].read([place])
         return unpack_episode(record, f"{path}, episode {place}")
 
+    def frames_of(self, task: str) -> range:
+        """The numbers of a task's frames, which follow each other."""
+        mine = [number for number, entry in enumerate(self._shards) if entry["task"] == task]
+        first, last = self._first_episode[mine[0]], self._first_episode[mine[-1] + 1]
+        return range(int(self._first_frame[first]), int(self._first_frame[last]))
+
     def locate(self, frame: int) -> tuple[int, int]:
         """(episode, frame in that episode) of a frame number."""
         if not 0 <= frame < self.num_frames:

@@ -126,7 +126,7 @@ def describe_dataset(opened: OpenDataset) -> str:
     constant = index.constant
     varying = len(index.components) - len(constant)
     told += f"; {varying} of {len(index.components)} components of the targets vary"
-    return told + (f" ({', '.join(constant)} do not)" if constant else "")
+    return told + (f" (constant: {', '.join(constant)})" if constant else "")
 
 
 class Stream:
