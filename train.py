@@ -23,6 +23,7 @@ import tyro
 
 import dsvla_jax.policy
 from configs import config_names, get_config
+from data_pipelines.first_look import fit_workspace, look_at_demonstrations, look_at_mixture
 from data_pipelines.loader import make_loader
 from data_pipelines.samples import make_sampler, make_validation_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations, open_held_out
@@ -64,6 +65,7 @@ def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "",
         tasks = choose_tasks(experiment.data)
         experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     require_possible(experiment)
+    experiment = with_workspace(experiment, run, tokenizer)
     mesh = make_mesh(experiment.mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     require_same_experiment(run, experiment)
@@ -172,9 +174,11 @@ def open_data(
         from data_pipelines.oxe.loader import OxeLoader
 
         loader = OxeLoader(experiment.oxe, experiment.encoding, tokenizer, **order)
+        print(*look_at_mixture(loader.source.datasets, experiment.encoding), sep="\n")
         return loader, loader.num_samples, loader.scale
     with first_process_first("demonstrations"):
         reader = open_demonstrations(experiment.data, tokenizer)
+    print(look_at_demonstrations(reader, experiment.encoding))
     sample = make_sampler(experiment.data, experiment.encoding, tokenizer)
     return make_loader(reader, sample, **order), reader.num_frames, None
 
@@ -248,6 +252,21 @@ def require_possible(experiment: Experiment) -> None:
             "validate_every: nothing is held out of Open X-Embodiment mixtures, whose displacements are binned over "
             "what training learns from; set it to 0, and judge the run by what is finetuned from it"
         )
+
+
+def with_workspace(experiment: Experiment, run: Path, tokenizer: Tokenizer) -> Experiment:
+    """The experiment with the workspace that its run or else its data have, where that is to be fitted."""
+    if not (experiment.fit_workspace and experiment.encoding.use_points):
+        return experiment
+    config = run / "config.json"
+    if config.exists():
+        known = load_experiment(config).encoding
+        box = {"workspace_low": known.workspace_low, "workspace_high": known.workspace_high}
+        return dataclasses.replace(experiment, encoding=dataclasses.replace(experiment.encoding, **box))
+    with first_process_first("demonstrations"):
+        encoding = fit_workspace(experiment.data, experiment.oxe, experiment.encoding, tokenizer)
+    print(f"workspace fitted: from {encoding.workspace_low} to {encoding.workspace_high}")
+    return dataclasses.replace(experiment, encoding=encoding)
 
 
 def tokenizer_of(experiment: Experiment) -> Tokenizer:

@@ -150,8 +150,8 @@ class EpisodeReader:
     Opening checks that every shard is complete; ``verify="sha256"`` reads them all and compares digests too.
     Episodes and frames are numbered through all shards, task by task, in the order in which they were written.
     `num_arms` is by task, `instructions` are those of the shards.
-    tasks: which tasks; all if None. episodes: only the first so many of each task; all if None. skip: without so many
-    before them. `fewer`: whether a task may have fewer.
+    tasks: which tasks, none twice; all if None. episodes: only the first so many of each task; all if None. skip:
+    without so many before them. `fewer`: whether a task may have fewer.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class EpisodeReader:
                 str(sorted(missing)),
                 "generate them, or choose others or all",
             )
-        self.tasks = tuple(present if tasks is None else tasks)
+        self.tasks = tuple(present if tasks is None else dict.fromkeys(tasks))
         self.settings: dict[str, Any] = index["settings"]
         self._shards = [
             shard for task in self.tasks for shard in self._choose(index["shards"], task, episodes, skip, fewer)
@@ -230,6 +230,12 @@ class EpisodeReader:
         place = number - int(self._first_episode[shard]) + self._shards[shard]["first"]
         (record,) = self._open[shard].read([place])
         return unpack_episode(record, f"{path}, episode {place}")
+
+    def frames_of(self, task: str) -> range:
+        """The numbers of a task's frames, which follow each other."""
+        mine = [number for number, entry in enumerate(self._shards) if entry["task"] == task]
+        first, last = self._first_episode[mine[0]], self._first_episode[mine[-1] + 1]
+        return range(int(self._first_frame[first]), int(self._first_frame[last]))
 
     def locate(self, frame: int) -> tuple[int, int]:
         """(episode, frame in that episode) of a frame number."""

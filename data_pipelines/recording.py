@@ -14,7 +14,7 @@ import numpy as np
 from data_pipelines.records import Episode, make_episode
 from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.errors import DataError
-from dsvla_jax.observation_checks import check_camera, check_keypoints, check_pictures, check_poses
+from dsvla_jax.observation_checks import check_camera, check_keypoints, check_pictures, check_poses, has_words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,9 +96,11 @@ def make_demonstration(
 
 def check_recording(recording: Recording, where: object) -> None:
     """Raises DataError unless texts, counts, poses and grippers are right. Looks at no picture."""
-    for field in ("task", "instruction"):
-        if not getattr(recording, field).strip():
-            raise DataError(where, field, "words", "nothing", "say what is demonstrated")
+    if not recording.task.strip():
+        raise DataError(where, "task", "words", "nothing", "say what is demonstrated")
+    if not has_words(recording.instruction):
+        got = repr(recording.instruction) if recording.instruction.strip() else "nothing"
+        raise DataError(where, "instruction", "words", got, "say what is demonstrated")
     if "/" in recording.task:
         raise DataError(where, "task", "a name for files", repr(recording.task), "leave out the slash")
     if recording.channels not in ("rgb", "bgr"):

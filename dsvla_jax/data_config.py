@@ -66,6 +66,9 @@ class OxeConfig:
     """Parts that episodes are dealt to. As many processes, or a divisor of it, read none of each other's records."""
     unsupported: Literal["refuse", "leave_out"] = "refuse"
     """What to do with datasets that do not tell what the target needs."""
+    unlabelled: Literal["leave_out", "keep", "refuse"] = "leave_out"
+    """What to do with episodes whose instruction is empty, blank or "nan": leave them out, as openvla does, learn from
+    them with prompts that ask for nothing, or stop."""
     colours_mended: bool = False
     """The copies have red and blue in their places, as those that went through rlds_dataset_mod for octo or openvla."""
     skip_bad: bool = False
@@ -79,8 +82,10 @@ class OxeConfig:
         _require(self.image_size > 0, "image_size", "at least 1", self.image_size)
         _require(self.window > 0, "window", "at least 1", self.window)
         _require(self.streams > 0, "streams", "at least 1", self.streams)
+        choices = ("leave_out", "keep", "refuse")
+        _require(self.unlabelled in choices, "unlabelled", "leave_out, keep or refuse", repr(self.unlabelled))
 
 
-def _require(holds: bool, field: str, expected: str, got: float) -> None:
+def _require(holds: bool, field: str, expected: str, got: float | str) -> None:
     if not holds:
         raise UserError(f"{field}: expected {expected}, got {got}")

@@ -52,6 +52,9 @@ def test_counts_features_and_statistics_are_those_of_the_folder(tmp_path):
     assert page.title.endswith("4 episodes, 12 samples")
     assert page.warnings == []
     assert table(page, "counts")["lamp_on"] == ("1", "4", "12", "3.0", "1", "1")
+    said = table(page, "what training says")
+    assert said["instructions"] == ("4 of 4 episodes have an instruction",)
+    assert said["targets"] == ("2 of 8 components of the targets vary (constant: x, y, qx, qy, qz, qw)",)
     assert table(page, "features")["depth"] == ("float32", "48 x 48", "m, 0: no reading")
     statistics = table(page, "statistics")
     heights = files.trajectory(frames=12)[0][[4, 9, 11], 0, 2]
@@ -91,7 +94,10 @@ def test_the_page_shows_frames_clouds_prompts_and_answers(tmp_path, capsys):
         ({"pose": np.tile(files.trajectory(12)[0][:1], (12, 1, 1))}, r"33 % of the samples ask for no motion"),
         ({"keypoints": BOX_TOP[None, None] + [0, 0, 0.3]}, r"half of the keypoints are 0.3\d m or more from"),
         ({"depth": [np.pad(np.ones((4, 4)), 22)] * 12}, r"99 % of the pixels have no depth"),
-        ({"depth": [np.full((48, 48), 2.9)] * 12}, r"3 of 3 clouds have no point in the workspace"),
+        (
+            {"depth": [np.full((48, 48), 2.9)] * 12},
+            r"3D input: lamp_on: depth: expected at least 2% of the",
+        ),
     ],
 )
 def test_what_is_mostly_a_mistake_is_warned_of(tmp_path, changes, warning):

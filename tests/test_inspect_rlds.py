@@ -150,7 +150,9 @@ def test_calibrated_depth_gives_clouds_and_rings(folder):
     strip = page.sections[0].pictures[0][1]
     np.testing.assert_allclose(strip[v, u].astype(int), (255, 0, 200), atol=2)
     low = look(folder, MANISKILL).warnings
-    assert any("a cloud has no point in the workspace (-1.5, -1.5, 0.76)" in warning for warning in low)
+    (warning,) = [warning for warning in low if warning.startswith("3D input: ")]
+    assert "in the workspace from (-1.5, -1.5, 0.76) to (1.5, 1.5, 3.0), got 0 of" in warning
+    assert "--encoding.workspace-low" in warning
 
 
 def test_what_cannot_be_trained_on_is_still_shown(folder, tmp_path):

@@ -81,6 +81,17 @@ def set_number(path, place, value):
     return change
 
 
+def matrices(path, size, change):
+    """Every step's matrix (size, size) of a feature changed."""
+
+    def changed(features):
+        values = features[path].float_list.value
+        matrix = np.array(values).reshape(-1, size, size)
+        values[:] = np.concatenate([change(one).ravel() for one in matrix]).tolist()
+
+    return changed
+
+
 def zeros(path):
     def change(features):
         values = features[path].float_list.value
@@ -114,7 +125,8 @@ def set_bytes(path, value):
 
 FRACTAL, STRETCH = "fractal20220817_data", "cmu_stretch"
 MANISKILL = "maniskill_dataset_converted_externally_to_rlds"
-EXTRINSIC = "steps/observation/main_camera_extrinsic_cv"
+EXTRINSIC, INTRINSIC = (f"steps/observation/main_camera_{name}_cv" for name in ("extrinsic", "intrinsic"))
+TILTED = np.array([[0.6, 0, 0.8, 0.3], [0, 1, 0, 0], [-0.8, 0, 0.6, 0], [0, 0, 0, 1]])
 SHARD, RECORD = "00001-of-00002", "00000-of-00002, record 1"
 # name: (dataset, damage, the place that is named, the message, usable episodes left)
 DAMAGE = {
@@ -204,6 +216,34 @@ DAMAGE = {
         in_record(zeros(EXTRINSIC)),
         RECORD,
         f"{EXTRINSIC}: expected matrices that can be inverted, got another",
+        5,
+    ),
+    "another matrix than a rotation": (
+        MANISKILL,
+        in_record(matrices(EXTRINSIC, 4, lambda matrix: matrix * [2, 1, 1, 1])),
+        f"{RECORD}, step 0",
+        "world_from_camera: expected a rotation, got one off by",
+        5,
+    ),
+    "camera in millimetres": (
+        MANISKILL,
+        in_record(matrices(EXTRINSIC, 4, lambda matrix: matrix * np.where(matrix == 1.5, 1000, 1))),
+        f"{RECORD}, step 0",
+        "world_from_camera: expected a place in metres",
+        5,
+    ),
+    "inverse camera": (
+        MANISKILL,
+        in_record(matrices(EXTRINSIC, 4, lambda matrix: np.linalg.inv(matrix @ TILTED))),
+        RECORD,
+        "camera: expected the hand in one 256 x 256 picture at least, got none",
+        5,
+    ),
+    "intrinsics of another size": (
+        MANISKILL,
+        in_record(matrices(INTRINSIC, 3, lambda matrix: np.diag([640 / 256, 480 / 256, 1]) @ matrix)),
+        f"{RECORD}, step 0",
+        "intrinsics: expected a centre in 256 x 256 pixels, got",
         5,
     ),
     "text that is none": (

@@ -52,6 +52,13 @@ def test_tasks_and_episodes_are_those_of_the_folder(folder, capsys):
         choose_tasks(data_config(folder / "elsewhere"))
     assert len(open_demonstrations(data_config(folder, tasks=("lamp_on",)), suite_tokenizer())) == 2
     assert capsys.readouterr().out == ""
+    # A task named twice is in the data once.
+    for twice in (("lamp_on", "lamp_on"), ("lamp_on,lamp_on",)):
+        assert choose_tasks(data_config(folder, tasks=twice)) == ("lamp_on",)
+    assert EpisodeReader(folder, ["lamp_on", "lamp_on"]).num_frames == EpisodeReader(folder, ["lamp_on"]).num_frames
+    for source in ("episodes", "simulator"):
+        with pytest.raises(UserError, match=r"data.tasks: expected names of tasks, or all, got none"):
+            choose_tasks(data_config(folder, source=source, tasks=(",",)))
     few = data_config(folder, tasks=("lamp_on",), episodes=1)
     assert len(open_demonstrations(few, suite_tokenizer())) == 1
     assert "1 of 2 demonstrations are used" in capsys.readouterr().out

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.episodes import EpisodeReader
+from data_pipelines.first_look import cloud_warnings, frames_of, say_components, say_words
 from data_pipelines.inspect.drawing import camera_of, draw_clouds, draw_frame, frame_cloud
 from data_pipelines.inspect.page import Page, Section, Table
 from data_pipelines.records import Episode, Frame, decode_frame
@@ -16,8 +17,6 @@ from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.geometry.rotations import rotation_distance
 from dsvla_jax.report import film_strip
 
-# Of every data set, so many frames are decoded for statistics of depth and clouds.
-LOOKED_AT = 60
 UNITS = {
     "rgb": "0 to 255",
     "depth": "m, 0: no reading",
@@ -39,9 +38,7 @@ def describe_episodes(folder: Path, tasks: Sequence[str] | None, shown: int, enc
     """The page of a folder of episodes. shown: how many episodes of each task are drawn."""
     reader = EpisodeReader(folder, tasks=tasks)
     episodes = [reader.episode(number) for number in range(len(reader))]
-    frames = [
-        reader.frame(int(number)) for number in np.unique(np.linspace(0, reader.num_frames - 1, LOOKED_AT).astype(int))
-    ]
+    frames = frames_of(reader)
     looks = [_look(frame, encoding) for frame in frames]
     by_task = {task: [x for x in episodes if x.task == task] for task in reader.tasks}
     sections = [
@@ -51,8 +48,8 @@ def describe_episodes(folder: Path, tasks: Sequence[str] | None, shown: int, enc
     ]
     return Page(
         title=f"{folder}: {len(reader)} episodes, {reader.num_frames} samples",
-        tables=[_features(frames[0]), _counts(by_task), _statistics(episodes, looks)],
-        warnings=_warnings(episodes, looks, encoding),
+        tables=[_features(frames[0]), _counts(by_task), _said(reader, episodes), _statistics(episodes, looks)],
+        warnings=[*_warnings(episodes, looks, encoding), *cloud_warnings(frames, encoding)],
         sections=sections,
     )
 
@@ -93,6 +90,12 @@ def _features(frame: Frame) -> Table:
     ]
     rows += [(name, "text", "", repr(frame[name])) for name in ("instruction", "task")]
     return Table("features of a sample", ("feature", "type", "shape", "unit"), rows, numbers=False)
+
+
+def _said(reader: EpisodeReader, episodes: list[Episode]) -> Table:
+    targets = [np.concatenate([x.target_pose, x.target_gripper[..., None]], axis=-1) for x in episodes]
+    rows = [("instructions", say_words(reader)), ("targets", say_components(targets))]
+    return Table("what training says of them", ("", ""), rows, numbers=False)
 
 
 def _counts(by_task: dict[str, list[Episode]]) -> Table:
@@ -179,12 +182,6 @@ def _warnings(episodes: list[Episode], looks: list[_Look], encoding: EncodingCon
     )
     if idle.mean() > 0.1:
         found.append(f"{100 * idle.mean():.0f} % of the samples ask for no motion: are the key poses right?")
-    if (empty := sum(look.in_workspace == 0 for look in looks)) > 0:
-        found.append(
-            f"{empty} of {len(looks)} clouds have no point in the workspace {encoding.workspace_low} to "
-            f"{encoding.workspace_high}: the policy would see none in 3D; move the world's origin, or set "
-            "encoding.workspace-low and -high"
-        )
     if (missing := np.mean([look.missing for look in looks])) > 0.5:
         found.append(f"{100 * missing:.0f} % of the pixels have no depth")
     distances = np.concatenate([look.keypoint_distance for look in looks])

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from data_pipelines.inspect.page import Table
 from data_pipelines.oxe.motion import Motion, displacement
+from dsvla_jax.encoding.displacement import LEAST_RANGE
 
 COMPONENTS = ("x (m)", "y (m)", "z (m)", "rx (rad)", "ry (rad)", "rz (rad)")
 STATISTICS = ("quantity", "mean", "deviation", "least", "1 %", "median", "99 %", "most")
@@ -91,7 +92,7 @@ def _draw_panel(
     picture = np.full((PANEL, WIDTH, 3), _GROUND, np.uint8)
     low, high = float(values.min()), float(values.max())
     # A constant is a line in the middle.
-    middle, half = (low + high) / 2, max((high - low) / 2, 1e-9)
+    middle, half = (low + high) / 2, max((high - low) / 2, LEAST_RANGE)
     top, bottom = 24, PANEL - 8
     x = np.linspace(LEFT, WIDTH - RIGHT, len(values)) if len(values) > 1 else np.array([LEFT], float)
     for level in (low, high):

@@ -9,25 +9,26 @@ from collections.abc import Sequence
 import numpy as np
 from tqdm import tqdm
 
-from data_pipelines.inspect.drawing import camera_of, draw_clouds, draw_frame
+from data_pipelines.first_look import dataset_views
+from data_pipelines.inspect.drawing import draw_clouds, draw_frame
 from data_pipelines.inspect.motions import COMPONENTS, draw_motion, motion_statistics
 from data_pipelines.inspect.page import Page, Section, Table
 from data_pipelines.inspect.stored import describe_stored, feature_table, shard_table
 from data_pipelines.oxe.dataset import OxeDataset
-from data_pipelines.oxe.index import main_view
+from data_pipelines.oxe.index import HIGH, LOW, main_view
 from data_pipelines.oxe.mixture import EncodedSample, OpenDataset, folder_of, open_mixture, shares_of
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import DATASETS, get_dataset
 from data_pipelines.oxe.samples import prompts_and_answers, write_picture
-from data_pipelines.oxe.scale import HIGH, LOW, MixtureScale
+from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.oxe.targets import why_unsupported
 from data_pipelines.records import Frame
 from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild
+from data_pipelines.workspace import require_points
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.displacement import displace
 from dsvla_jax.encoding.encode import EncodingConfig
-from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.report import MAX_STRIP_FRAMES, film_strip
 
@@ -80,16 +81,12 @@ def describe_build(
     index = opened.index
     title = f"{build.folder}: {len(index.samples):,} usable episodes, {index.num_samples:,} samples"
     numbers = np.unique(np.linspace(0, len(index.samples) - 1, shown).astype(int)) if shown else []
-    sections, clouds = [], []
-    for number in numbers:
-        section, cloud = _section(opened, int(number), encoding, scale)
-        sections.append(section)
-        clouds += [] if cloud is None else [cloud]
+    sections = [_section(opened, int(number), encoding, scale) for number in numbers]
     warnings = [f"left out: {where}: {why}" for where, why in index.left_out]
     tables += [_counts(opened, motions), motion_statistics(motions)]
     if scale is not None:
         tables.append(_targets(opened, scale))
-    return Page(title, tables, warnings + _warnings(opened, motions, clouds, encoding), sections)
+    return Page(title, tables, warnings + _warnings(opened, motions, encoding), sections)
 
 
 def _open(build: RldsBuild, dataset: OxeDataset, config: OxeConfig) -> tuple[OpenDataset, MixtureScale | None]:
@@ -153,10 +150,8 @@ def _targets(opened: OpenDataset, scale: MixtureScale) -> Table:
     return Table(f"targets: displacements to the pose {ahead}, of all samples", columns, rows)
 
 
-def _section(
-    opened: OpenDataset, number: int, encoding: EncodingConfig, scale: MixtureScale | None
-) -> tuple[Section, Frame | None]:
-    """One episode; and its first frame where it has a calibrated camera."""
+def _section(opened: OpenDataset, number: int, encoding: EncodingConfig, scale: MixtureScale | None) -> Section:
+    """One episode."""
     episode = opened.parse(number)
     samples = opened.read(number)
     chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_STRIP_FRAMES).round().astype(int))
@@ -172,7 +167,7 @@ def _section(
     for prompt, answer, _ in prompts_and_answers([samples[i] for i in chosen], encoding, scale):
         lines += [prompt, f"    {answer}"]
     heading = f"{episode.where}: “{samples[0].instruction}”"
-    return Section(heading, drawn, lines), frames[0] if samples[0].camera is not None else None
+    return Section(heading, drawn, lines)
 
 
 def _frame(sample: EncodedSample, number: int, config: OxeConfig) -> Frame:
@@ -201,9 +196,7 @@ def _frame(sample: EncodedSample, number: int, config: OxeConfig) -> Frame:
     )
 
 
-def _warnings(
-    opened: OpenDataset, motions: Sequence[Motion], clouds: Sequence[Frame], encoding: EncodingConfig
-) -> list[str]:
+def _warnings(opened: OpenDataset, motions: Sequence[Motion], encoding: EncodingConfig) -> list[str]:
     """What is not refused, because it may be meant, but should be known."""
     found = []
     low, high = np.array(encoding.codec.low), np.array(encoding.codec.high)
@@ -220,15 +213,15 @@ def _warnings(
         found.append("positions are in units that are not known: displacements are stretched to the mixture's range")
     if all((motion.gripper_command == motion.gripper_command[0]).all() for motion in motions):
         found.append("no gripper ever changes")
-    if not all(motion.instruction for motion in motions):
-        found.append("some episodes have no instruction")
-    for frame in clouds:
-        box = (encoding.workspace_low, encoding.workspace_high)
-        _, valid = cloud_from_depth(frame["depth"], camera_of(frame), *box, encoding.stride)
-        if not np.any(valid):
-            found.append(
-                f"a cloud has no point in the workspace {box[0]} to {box[1]}: the policy would see none in 3D; set "
-                "encoding.workspace-low and -high"
-            )
-            break
+    if count := opened.index.unlabelled:
+        left_out = opened.config.unlabelled == "leave_out"
+        use = "left out" if left_out else "learned from with prompts that ask for nothing"
+        found.append(f"{count:,} of {opened.num_episodes:,} episodes have no instruction: they are {use}")
+    if still := [name for name in opened.index.constant if name != "gripper"]:
+        found.append(f"{', '.join(still)} of the targets do not vary: every answer says the same of them")
+    if opened.dataset.depth is not None:
+        try:
+            require_points(opened.dataset.name, dataset_views(opened), encoding)
+        except UserError as error:
+            found.append(f"3D input: {error}")
     return found

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from data_pipelines.oxe.fixtures import write_fixtures
-from data_pipelines.oxe.mixture import MixtureSource
+from data_pipelines.oxe.mixture import MixtureSource, describe_dataset
 from data_pipelines.oxe.registry import DATASETS, MIXTURES, get_dataset
 from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.vocabulary import write_vocabulary
@@ -62,6 +62,8 @@ def prepare(config: Annotated[OxeConfig, tyro.conf.arg(name="")], seed: int = 0)
         )
         table.add_row(item.dataset.name, *numbers, megabytes)
     Console().print(table)
+    for item in source.datasets:
+        print(describe_dataset(item))
     for where, why in source.left_out:
         print(f"left out: {where}: {why}")
     if config.target == "relative":

@@ -9,6 +9,7 @@ import numpy as np
 from data_pipelines.oxe.motion import Arm, Column, Motion, require_finite
 from data_pipelines.rlds.features import RldsEpisode
 from dsvla_jax.errors import DataError
+from dsvla_jax.observation_checks import has_words
 
 Encoding = Literal["end_effector", "joints", "navigation"]
 View = Literal["primary", "secondary", "wrist"]
@@ -108,11 +109,14 @@ class OxeDataset:
         return Motion(self._instruction(episode), pose, state[steps], action, command[steps], joints)
 
     def _instruction(self, episode: RldsEpisode) -> str:
+        """Of the first step, without the space around it; nothing where it has no words."""
         path = f"steps/{self.language}"
         if self.code_points:
             points = episode.column(path)[0].astype(np.uint8)
-            return bytes(points).split(b"\0")[0].decode(errors="replace").strip()
-        return episode.text(path)[0].strip()
+            text = bytes(points).split(b"\0")[0].decode(errors="replace")
+        else:
+            text = episode.text(path)[0]
+        return text.strip() if has_words(text) else ""
 
 
 def _columns(episode: RldsEpisode, columns: list[Column | None], name: str) -> np.ndarray | None:

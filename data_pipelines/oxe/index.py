@@ -20,18 +20,28 @@ from data_pipelines.oxe import dataset as dataset_module
 from data_pipelines.oxe import motion as motion_module
 from data_pipelines.oxe import registry, targets
 from data_pipelines.oxe.dataset import OxeDataset
+from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.targets import make_targets
 from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild, Shard, TFRecordFile
+from data_pipelines.rlds.features import RldsEpisode
+from dsvla_jax import observation_checks
 from dsvla_jax.command_line import cache_folder
 from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding import displacement
+from dsvla_jax.encoding.displacement import is_constant
 from dsvla_jax.encoding.text import split_words
 from dsvla_jax.errors import DataError
+from dsvla_jax.observation_checks import check_camera, check_in_view, check_poses
 
-VERSION = 2
+VERSION = 3
 KEPT_FRAMES = 1 << 18
 """Frames whose displacements quantiles are taken from; of more, evenly spaced ones are kept."""
 QUANTILES = 101
+LOW, HIGH = round(0.01 * (QUANTILES - 1)), round(0.99 * (QUANTILES - 1))
+"""The quantiles that displacements are binned between."""
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+DISPLACEMENT = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +50,9 @@ class Index:
 
     shards: paths. offsets: of each TFRecord shard, else None. shard, record, samples: int64 (E,), of the E usable
     episodes: where each is, and how many samples it gives. quantiles: (101, 6) of all arms' displacements, ascending,
-    or None for absolute targets. words: all words and signs of the instructions. bytes: of an average record. left_out:
-    record and reason, of skipped ones.
+    or None for absolute targets. low, high: (8,) or (7,), least and most of each of `components` in all targets. words:
+    all words and signs of the instructions. bytes: of an average record. unlabelled: episodes without an instruction,
+    which are not among the E where those are left out. left_out: record and reason, of skipped ones.
     """
 
     shards: list[str]
@@ -50,13 +61,29 @@ class Index:
     record: np.ndarray
     samples: np.ndarray
     quantiles: np.ndarray | None
+    low: np.ndarray
+    high: np.ndarray
     words: list[str]
     bytes: float
+    unlabelled: int
     left_out: list[tuple[str, str]]
 
     @property
     def num_samples(self) -> int:
         return int(self.samples.sum())
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the parts of a target, for all arms."""
+        return (*(POSE if self.quantiles is None else DISPLACEMENT), "gripper")
+
+    @property
+    def constant(self) -> tuple[str, ...]:
+        """Those that do not vary, of displacements between the quantiles that are binned."""
+        low, high = self.low.copy(), self.high.copy()
+        if self.quantiles is not None:
+            low[:6], high[:6] = self.quantiles[[LOW, HIGH]]
+        return tuple(name for name, still in zip(self.components, is_constant(low, high), strict=True) if still)
 
 
 def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True) -> Index:
@@ -71,6 +98,8 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
     if not len(index.samples):
         reasons = "; ".join(f"{where}: {why}" for where, why in index.left_out[:2])
         fix = "choose another split, or look at its records" + (f" ({reasons})" if reasons else "")
+        if index.unlabelled:
+            fix = f"{index.unlabelled} have no instruction: set unlabelled to keep to learn from them without words"
         raise DataError(build.folder, f"split {config.split}", "at least one usable episode", "none", fix)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Not the process's number: it is the same in two containers that share a disk.
@@ -87,7 +116,8 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
     places: list[tuple[int, int, int]] = []
     offsets: list[np.ndarray] = []
     words: set[str] = set()
-    seen = size = count = 0
+    seen = size = count = unlabelled = 0
+    low = high = None
     total = sum(shard.records for shard in shards)
     bar = tqdm(total=total, unit="episode", desc=f"index {dataset.name}", disable=not progress, leave=False)
     for number, shard in enumerate(shards):
@@ -115,13 +145,23 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
                 motion = dataset.motion(episode)
                 made = make_targets(motion, dataset, config)
                 check_pictures(episode, dataset)
+                check_camera_and_hands(episode, dataset, motion)
             except DataError as error:
                 _leave_out(error, where, left_out, config)
                 continue
+            if not motion.instruction and len(made.frame):
+                unlabelled += 1
+                if config.unlabelled == "leave_out":
+                    continue
             words.update(split_words(motion.instruction))
             size, count = size + len(data), count + 1
             if len(made.frame):
                 places.append((number, record, len(made.frame)))
+                moved = made.displacement if made.target_pose is None else made.target_pose
+                parts = np.concatenate([np.asarray(moved), made.target_gripper[..., None]], axis=-1)
+                least, most = parts.min(axis=(0, 1)), parts.max(axis=(0, 1))
+                low = least if low is None else np.minimum(low, least)
+                high = most if high is None else np.maximum(high, most)
             if made.displacement is not None:
                 taken = np.arange(seen, seen + len(made.frame)) % spacing == 0
                 rows.append(made.displacement[taken])
@@ -141,19 +181,37 @@ def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: boo
         record=record_of,
         samples=samples,
         quantiles=quantiles,
+        low=np.zeros(0) if low is None else low.astype(np.float64),
+        high=np.zeros(0) if high is None else high.astype(np.float64),
         words=sorted(words),
         bytes=size / max(count, 1),
+        unlabelled=unlabelled,
         left_out=left_out,
     )
 
 
-def check_pictures(episode: Any, dataset: OxeDataset) -> None:
-    """Raises DataError unless every step has the picture that is trained on, and the depth and camera if there are."""
+def check_pictures(episode: RldsEpisode, dataset: OxeDataset) -> None:
+    """Raises DataError unless every step has the picture that is trained on, and its depth if there is any."""
     view = main_view(dataset)
     episode.encoded(f"steps/observation/{dataset.images[view]}")
     if dataset.depth is not None:
         episode.encoded(f"steps/observation/{dataset.depth.key}")
-        dataset.depth.cameras(episode)
+
+
+def check_camera_and_hands(episode: RldsEpisode, dataset: OxeDataset, motion: Motion) -> None:
+    """Raises DataError unless the camera of calibrated depth is one, and sees the hands at some step."""
+    if dataset.depth is None:
+        return
+    intrinsics, poses = dataset.depth.cameras(episode)
+    size = episode.picture_size(f"steps/observation/{dataset.images[main_view(dataset)]}")
+    # Most cameras stand still: each is looked at once.
+    rows = np.concatenate([intrinsics.reshape(len(intrinsics), -1), poses.reshape(len(poses), -1)], axis=1)
+    for step in sorted(np.unique(rows, axis=0, return_index=True)[1].tolist()):
+        check_camera(intrinsics[step], poses[step], size, f"{episode.where}, step {step}")
+    if motion.pose is not None:
+        steps = dataset.steps(episode)
+        check_poses(motion.pose, episode.where)
+        check_in_view(motion.pose[..., :3], intrinsics[steps], poses[steps], size, episode.where)
 
 
 def main_view(dataset: OxeDataset) -> Any:
@@ -174,13 +232,13 @@ def _leave_out(error: DataError, where: str, left_out: list[tuple[str, str]], co
 
 def _fingerprint(build: RldsBuild, dataset: OxeDataset, config: OxeConfig) -> str:
     """Changes where the files, the features, the code that reads them or the targets change."""
-    code = [dataset_module, *registry.MODULES, motion_module, targets]
+    code = [dataset_module, *registry.MODULES, motion_module, targets, observation_checks, displacement]
     parts = [
         str(VERSION),
         json.dumps(build.features_json, sort_keys=True),
         repr([(shard.path, shard.records, _stamp(shard.path)) for shard in build.shards(config.split)]),
         *(Path(str(module.__file__)).read_text() for module in code),
-        repr((dataset.name, config.split, config.target, config.horizon, config.skip_bad)),
+        repr((dataset.name, config.split, config.target, config.horizon, config.skip_bad, config.unlabelled)),
     ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
@@ -211,6 +269,7 @@ def _pack(index: Index) -> dict[str, Any]:
 def _unpack(stored: dict[str, Any]) -> Index:
     arrays = {name: np.array(stored[name], np.int64) for name in ("shard", "record", "samples")}
     offsets = None if stored["offsets"] is None else [np.array(row, np.int64) for row in stored["offsets"]]
+    arrays |= {name: np.array(stored[name], np.float64) for name in ("low", "high")}
     quantiles = None if stored["quantiles"] is None else np.array(stored["quantiles"], np.float64)
     left_out = [(where, why) for where, why in stored["left_out"]]
     return Index(**{**stored, **arrays, "offsets": offsets, "quantiles": quantiles, "left_out": left_out})

@@ -19,7 +19,7 @@ from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.features import ImageFormat, RldsEpisode, image_format
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.errors import UserError
+from dsvla_jax.errors import DataError, UserError
 
 ENDLESS = 1 << 40
 
@@ -59,7 +59,16 @@ class OpenDataset:
         self.build, self.dataset, self.config = build, dataset, config
         self.view = main_view(dataset)
         self.index: Index = load_index(self.build, dataset, config, progress)
+        if config.unlabelled == "refuse" and self.index.unlabelled:
+            got = f"{self.index.unlabelled} of {self.num_episodes} without"
+            raise DataError(build.folder, "instructions", "one an episode", got, "set unlabelled to leave_out or keep")
         self._shards = build.shards(config.split)
+
+    @property
+    def num_episodes(self) -> int:
+        """Usable ones, and those that are left out for want of an instruction."""
+        left_out = self.index.unlabelled if self.config.unlabelled == "leave_out" else 0
+        return len(self.index.samples) + left_out
 
     def parse(self, episode: int) -> RldsEpisode:
         """The usable episode of that number as it is stored."""
@@ -106,6 +115,18 @@ class OpenDataset:
         path = f"steps/observation/{depth.key}"
         encoded, kind = list(episode.encoded(path)), image_format(self.build.features[path])
         return [Camera(intrinsics[i], poses[i], depth.unit, encoded[i], kind) for i in range(episode.num_steps)]
+
+
+def describe_dataset(opened: OpenDataset) -> str:
+    """One line: how many episodes have words, and which components of the targets vary."""
+    index, episodes = opened.index, opened.num_episodes
+    told = f"{opened.dataset.name}: {episodes - index.unlabelled:,} of {episodes:,} episodes have an instruction"
+    if index.unlabelled:
+        told += "; the others are " + ("left out" if opened.config.unlabelled == "leave_out" else "kept")
+    constant = index.constant
+    varying = len(index.components) - len(constant)
+    told += f"; {varying} of {len(index.components)} components of the targets vary"
+    return told + (f" (constant: {', '.join(constant)})" if constant else "")
 
 
 class Stream:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from data_pipelines.rlds.features import RldsEpisode
 from dsvla_jax.errors import DataError
+from dsvla_jax.observation_checks import QUATERNION_TOLERANCE
 
 RotationKind = Literal["rpy", "ypr", "zxy", "xyzw", "wxyz", "rotvec", "matrix", "yaw", "none"]
 Column = Callable[[RldsEpisode], np.ndarray]
@@ -29,7 +30,7 @@ FRANKA_WIDTH = 0.08
 class Motion:
     """One episode as the policy sees it, without its pictures. float32.
 
-    pose: (T, A, 7), or None where the data do not tell it.
+    instruction: empty where the episode has none. pose: (T, A, 7), or None where the data do not tell it.
     gripper_open: (T, A), as measured, or else as last commanded.
     action: (T, A, 6), commanded displacement of each step, translation and rotation vector; or None.
     gripper_command: (T, A). joints: (T, A, J) for datasets that tell joints only, else None.
@@ -187,12 +188,15 @@ def relative_closing(column: Column) -> Column:
 
 
 def settled(column: Column) -> Column:
-    """(T,): a continuous opening as 0 or 1, a half-way reading counting as the end that the motion reaches."""
+    """(T,): a continuous opening as 0 or 1, a half-way reading counting as the end that the motion reaches.
+
+    Where the episode ends half-way, the readings since the last end are all the last one, as in octo and openvla.
+    """
 
     def column_of(episode: RldsEpisode) -> np.ndarray:
         values = column(episode)[:, 0]
         result = np.where(values > 0.95, 1.0, np.where(values < 0.05, 0.0, np.nan))
-        following = float(values[-1] > 0.5) if len(values) else 0.0
+        following = float(values[-1]) if len(values) else 0.0
         for place in range(len(values) - 1, -1, -1):
             following = following if np.isnan(result[place]) else float(result[place])
             result[place] = following
@@ -225,10 +229,8 @@ def as_rotation(values: np.ndarray, kind: RotationKind, turn: float, where: str)
     """(T, size of the kind) as rotations. rpy: about fixed x, y, z. ypr: yaw, pitch, roll. zxy: about fixed z, x, y."""
     match kind:
         case "xyzw" | "wxyz":
-            values = values if kind == "xyzw" else np.roll(values, -1, axis=1)
-            if np.any(np.abs(values).sum(1) == 0):
-                raise DataError(where, "rotation", "quaternions", "four zeros", "leave the episode out with --skip-bad")
-            return Rotation.from_quat(values)
+            _require_unit(values, where)
+            return Rotation.from_quat(values if kind == "xyzw" else np.roll(values, -1, axis=1))
         case "rpy":
             return Rotation.from_euler("xyz", values * turn)
         case "ypr":
@@ -241,6 +243,15 @@ def as_rotation(values: np.ndarray, kind: RotationKind, turn: float, where: str)
             return Rotation.from_euler("z", values * turn)
         case _:
             return Rotation.from_rotvec(np.zeros((len(values), 3)))
+
+
+def _require_unit(quaternions: np.ndarray, where: str) -> None:
+    """Raises DataError naming the first step of quaternions (T, 4) whose length is not 1."""
+    length = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1) > QUATERNION_TOLERANCE)
+    if len(wrong):
+        fix = "is this the version of the dataset that the registry describes? Or leave the episode out with --skip-bad"
+        raise DataError(where, "rotation", "unit quaternions", f"length {length[wrong[0]]:.4g} at step {wrong[0]}", fix)
 
 
 _ROTATION_SIZE = {"rpy": 3, "ypr": 3, "zxy": 3, "xyzw": 4, "wxyz": 4, "rotvec": 3, "yaw": 1, "none": 0}

@@ -79,6 +79,10 @@ def get_mixture(names: tuple[str, ...]) -> dict[str, float]:
         _lookup(name, {**DATASETS, **MIXTURES}, "dataset or mixture")
         if name in MIXTURES:
             raise UserError(f"mixture: {name} is a mixture and stands alone; got {', '.join(names)}")
+        if name in weights:
+            raise UserError(
+                f"mixture: {name} stands there twice; name it once, with a weight ({name}=2) for a larger share"
+            )
         try:
             weights[name] = float(weight or 1.0)
         except ValueError:

@@ -19,6 +19,7 @@ from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import DataError
+from dsvla_jax.observation_checks import check_depth
 
 
 def make_batcher(
@@ -113,6 +114,7 @@ def write_picture(
         if counts.shape != (height, width):
             fix = "only depth of the picture's own size can be used"
             raise DataError(frame.where, "depth", f"{height} x {width}", f"{counts.shape[0]} x {counts.shape[1]}", fix)
+        check_depth(counts * np.float32(camera.depth_unit), frame.where)
         depth = crop_resize(counts, box, config.image_size, nearest=True) * np.float32(camera.depth_unit)
         intrinsics, pose = crop_intrinsics(camera.intrinsics, box, config.image_size), camera.world_from_camera
     return {"depth": depth, "intrinsics": intrinsics, "world_from_camera": pose}

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data_pipelines.oxe.index import QUANTILES
+from data_pipelines.oxe.index import HIGH, LOW, QUANTILES
 from data_pipelines.oxe.mixture import OpenDataset
-from dsvla_jax.encoding.displacement import DisplacementScale
-
-LOW, HIGH = round(0.01 * (QUANTILES - 1)), round(0.99 * (QUANTILES - 1))
+from dsvla_jax.encoding.displacement import DisplacementScale, is_constant
 
 
 class MixtureScale:
@@ -39,8 +37,9 @@ class MixtureScale:
         if own is None:
             return displacement
         low, high = np.array(self.scale.low), np.array(self.scale.high)
-        span = np.where(own[1] > own[0], own[1] - own[0], 1.0)
-        fraction = np.where(own[1] > own[0], (displacement - own[0]) / span, 0.5)
+        still = is_constant(*own)
+        span = np.where(still, 1.0, own[1] - own[0])
+        fraction = np.where(still, 0.5, (displacement - own[0]) / span)
         return low + fraction * (high - low)
 
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from data_pipelines.oxe.dataset import OxeDataset
 from data_pipelines.oxe.motion import Motion, displacement
 from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding.displacement import LEAST_RANGE
 from dsvla_jax.errors import UserError
 
 # A pose that says nothing: the middle of the codec's box, no rotation. Stands for poses that a dataset does not tell.
@@ -90,7 +91,8 @@ def key_frames(motion: Motion) -> list[int]:
     """
     steps = motion.num_steps
     moves = _speeds(motion)
-    still = moves < STILL_FRACTION * max(float(moves.max(initial=0.0)), 1e-9)
+    # A hand that only trembles does not rest now and then: it stands still throughout.
+    still = moves < max(STILL_FRACTION * float(moves.max(initial=0.0)), LEAST_RANGE)
     changed = np.zeros(steps, bool)
     changed[1:] = np.any((motion.gripper_command[1:] > 0.5) != (motion.gripper_command[:-1] > 0.5), axis=1)
     found, pause = [], 0

@@ -133,6 +133,11 @@ class RldsEpisode:
             self.encoded(path)[step], image_format(self._feature(path)), f"{self.where}, step {step}, {path}"
         )
 
+    def picture_size(self, path: str) -> tuple[int, int]:
+        """(height, width) of the pictures of a step's image feature, or where that leaves it open of the first one."""
+        height, width, _ = image_format(self._feature(path)).shape
+        return self.image(path, 0).shape[:2] if height is None or width is None else (height, width)
+
     def _feature(self, path: str) -> Any:
         if path not in self._features:
             near = ", ".join(sorted(name for name in self._features if name.split("/")[0] == path.split("/")[0]))

@@ -13,13 +13,21 @@ from dsvla_jax.encoding.codec import PoseCodec
 
 HALF_RANGE_ANGLE = np.pi / 2
 """Radians that stand for the end of the range of one axis; three ends together stay below a half turn."""
+LEAST_RANGE = 1e-6
+"""Metres or radians: a component that varies less is constant. Its variation is the rounding of float32, which bins
+would blow up to their whole range."""
+
+
+def is_constant(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """bool (...): whether numbers between `low` and `high` (...) vary by no more than `LEAST_RANGE`."""
+    return high - low <= LEAST_RANGE
 
 
 @dataclasses.dataclass(frozen=True)
 class DisplacementScale:
     """The range of each component that the bins cover: `low` to `high`, metres and radians.
 
-    A component that does not vary (high = low) is written as the middle and read as `low`.
+    A component that does not vary (by more than `LEAST_RANGE`) is written as the middle and read as `low`.
     """
 
     low: tuple[float, ...]
@@ -29,11 +37,16 @@ class DisplacementScale:
         if len(self.low) != 6 or len(self.high) != 6 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(f"DisplacementScale: expected six low <= high, got {self.low} and {self.high}")
 
+    @property
+    def varies(self) -> np.ndarray:
+        """bool (6,): which components do."""
+        return ~is_constant(np.array(self.low), np.array(self.high))
+
     def to_pose(self, displacement: ArrayLike, codec: PoseCodec) -> np.ndarray:
         """(..., 6) -> float32 (..., 7), inside the codec's box; what lies beyond the range is moved to its end."""
         low, high = np.array(self.low), np.array(self.high)
-        span = np.where(high > low, high - low, 1.0)
-        fraction = np.where(high > low, 2 * (np.asarray(displacement, np.float64) - low) / span - 1, 0.0)
+        span = np.where(self.varies, high - low, 1.0)
+        fraction = np.where(self.varies, 2 * (np.asarray(displacement, np.float64) - low) / span - 1, 0.0)
         fraction = np.clip(fraction, -1.0, 1.0)
         centre, half = _box(codec)
         rotation = rotation_vector_to_quaternion(fraction[..., 3:] * HALF_RANGE_ANGLE)
@@ -46,7 +59,7 @@ class DisplacementScale:
         rotation = quaternion_to_rotation_vector(pose[..., 3:]) / HALF_RANGE_ANGLE
         fraction = np.clip(np.concatenate([(pose[..., :3] - centre) / half, rotation], axis=-1), -1.0, 1.0)
         low, high = np.array(self.low), np.array(self.high)
-        return np.where(high > low, low + (fraction + 1) / 2 * (high - low), low).astype(np.float32)
+        return np.where(self.varies, low + (fraction + 1) / 2 * (high - low), low).astype(np.float32)
 
 
 def displace(pose: ArrayLike, displacement: ArrayLike) -> np.ndarray:

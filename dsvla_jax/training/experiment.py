@@ -73,6 +73,9 @@ class Experiment:
     """Parts in which a batch is computed, one after the other: less memory, the same step."""
     mesh: MeshConfig = dataclasses.field(default_factory=MeshConfig)
     """How the devices share the work; the outcome is the same on any mesh."""
+    fit_workspace: bool = False
+    """Takes the workspace from the data instead of `encoding`: a box around all places of the hands, above the table.
+    The run's config.json and policy.json hold it."""
     soft_target_sigma: float = 0.0
     """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0
