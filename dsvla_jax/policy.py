@@ -21,7 +21,8 @@ from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_obser
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer
 from dsvla_jax.encoding.prompts import format_answer
-from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.encoding.text import Tokenizer, quoted, unknown_words
+from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
 from dsvla_jax.model.layers_apart import take_apart
@@ -32,6 +33,24 @@ from dsvla_jax.types import Action, Array, ModelInputs, Observation
 
 
 @dataclasses.dataclass(frozen=True)
+class LearnedFrom:
+    """What a policy saw in training, which is what it must be asked with."""
+
+    source: Literal["simulator", "demonstrations", "oxe"]
+    """The task suite, imported or own demonstrations, or Open X-Embodiment."""
+    keypoints: Literal["none", "oracle", "segmentation", "recorded"]
+    """none: prompts without them. oracle: the task's own. segmentation: found in the first picture with the simulator's
+    masks. recorded: those of the demonstrations."""
+    image_size: tuple[int, int]
+    """Height and width of the pictures, pixels."""
+    arms: tuple[int, ...]
+    """The numbers of arms."""
+    tasks: tuple[str, ...] = ()
+    camera: str = ""
+    """The camera's name; empty if the data do not say."""
+
+
+@dataclasses.dataclass(frozen=True)
 class PolicyConfig:
     """What inference needs to know of a run besides its weights and vocabulary."""
 
@@ -39,6 +58,14 @@ class PolicyConfig:
     model: ModelConfig
     displacement: DisplacementScale | None = None
     """The range of answers that say where to go from the present pose; None for answers that are poses."""
+    learned_from: LearnedFrom | None = None
+    """None for runs of versions that did not keep it."""
+
+    @property
+    def wants_keypoints(self) -> bool:
+        """Whether prompts state a keypoint, because those of training did."""
+        seen = self.learned_from is None or self.learned_from.keypoints != "none"
+        return self.encoding.use_keypoints and seen
 
 
 # Batches are filled up to one of these sizes, so that any size runs without compiling again; beyond, to a multiple of
@@ -99,8 +126,13 @@ class Policy:
         """The question of one robot as tokens int32 (T,) and their mask bool (T,), see `encode_text`.
 
         pose: (A, 7). gripper_open: (A,). keypoints: (A, 3), the active ones, or None.
-        Raises ValueError where the instruction is too long or has a number that no token stands for.
+        Raises UserError if the instruction has a word or number that no token stands for, ValueError if it is too long.
         """
+        if unknown := unknown_words([instruction], self.tokenizer):
+            raise UserError(
+                f"the policy's vocabulary has no token for {quoted(unknown)}; expected words that the policy "
+                "was trained with"
+            )
         encoding = self.config.encoding
         prompt = build_prompt(encoding, instruction, pose, gripper_open, keypoints)
         return encode_text(self.tokenizer, prompt, None, encoding.max_text_length)[:2]
