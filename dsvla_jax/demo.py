@@ -17,6 +17,7 @@ import dsvla_jax.policy
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
 from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.policy import Decision, Policy
 from dsvla_jax.report import mark_targets, png_data, write_html
@@ -24,7 +25,7 @@ from dsvla_jax.rollout import run_episodes
 from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.sim.tasks import TASKS, select_tasks
 from dsvla_jax.training.experiment import load_experiment
 from dsvla_jax.types import Action, Observation
 
@@ -120,6 +121,8 @@ def main(options: Options) -> None:
     """Runs the episode and writes the page."""
     experiment = load_experiment(options.run / "config.json")
     data = experiment.data
+    if not options.task and (experiment.oxe is not None or not set(data.tasks) <= TASKS.keys()):
+        raise UserError(f"{options.run}: learned no task of the simulator; name one to try it on (--task lamp_on)")
     (task,) = select_tasks((options.task,)) if options.task else select_tasks(data.tasks)[:1]
     policy, environment = dsvla_jax.policy.load(options.run), Environment(task, image_size=data.image_size)
     print(f"{task}, episode {options.seed}: compiling takes a minute the first time", flush=True)
