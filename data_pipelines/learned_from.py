@@ -1,4 +1,4 @@
-"""What a run's demonstrations are like, which its policy keeps: see `dsvla_jax.policy.LearnedFrom`."""
+"""What a run's demonstrations are like, which its policy keeps: see `dsvla_jax.data_config.LearnedFrom`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,8 +6,7 @@ from pathlib import Path
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.records import picture_size
 from data_pipelines.sources import choose_tasks
-from dsvla_jax.data_config import DataConfig, OxeConfig
-from dsvla_jax.policy import LearnedFrom
+from dsvla_jax.data_config import DataConfig, LearnedFrom, OxeConfig
 
 
 def learned_from(data: DataConfig, use_keypoints: bool) -> LearnedFrom:

@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
@@ -30,24 +31,6 @@ from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import Action, Array, ModelInputs, Observation
-
-
-@dataclasses.dataclass(frozen=True)
-class LearnedFrom:
-    """What a policy saw in training, which is what it must be asked with."""
-
-    source: Literal["simulator", "demonstrations", "oxe"]
-    """The task suite, imported or own demonstrations, or Open X-Embodiment."""
-    keypoints: Literal["none", "oracle", "segmentation", "recorded"]
-    """none: prompts without them. oracle: the task's own. segmentation: found in the first picture with the simulator's
-    masks. recorded: those of the demonstrations."""
-    image_size: tuple[int, int]
-    """Height and width of the pictures, pixels."""
-    arms: tuple[int, ...]
-    """The numbers of arms."""
-    tasks: tuple[str, ...] = ()
-    camera: str = ""
-    """The camera's name; empty if the data do not say."""
 
 
 @dataclasses.dataclass(frozen=True)

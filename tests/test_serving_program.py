@@ -16,9 +16,9 @@ from configs.tiny import config as tiny_config
 from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
 from dsvla_jax.checkpoints import RunCheckpoints
-from dsvla_jax.data_config import DataConfig, OxeConfig
+from dsvla_jax.data_config import DataConfig, LearnedFrom, OxeConfig
 from dsvla_jax.errors import UserError
-from dsvla_jax.policy import LearnedFrom, load_policy_config, save_policy_config
+from dsvla_jax.policy import load_policy_config, save_policy_config
 from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.serving.__main__ import Options, build_server
 from dsvla_jax.serving.requests import Expected, parse_request
@@ -115,12 +115,14 @@ def test_a_token_file_is_read_as_people_write_it(tmp_path, run_of_own_demonstrat
 
 def test_demonstrations_say_what_a_policy_learns_from(tmp_path):
     files.write_dataset(tmp_path / "source", ["lamp_on"], episodes=1, size=24, frames=12, descriptions=["press it"])
-    for keypoints, expected in (("contacts", "recorded"), ("none", "none")):
-        folder = tmp_path / keypoints
-        import_demonstrations(tmp_path / "source", folder, Settings(keypoints=keypoints), progress=False)
+    for settings, expected in (
+        (Settings(), LearnedFrom("demonstrations", "recorded", (24, 24), (1,), ("lamp_on",), "front")),
+        (Settings(keypoints="none"), LearnedFrom("demonstrations", "none", (24, 24), (1,), ("lamp_on",), "front")),
+    ):
+        folder = tmp_path / settings.keypoints
+        import_demonstrations(tmp_path / "source", folder, settings, progress=False)
         data = DataConfig(source="episodes", folder=str(folder), tasks=("all",))
-        learned = learned_from(data, use_keypoints=True)
-        assert learned == LearnedFrom("demonstrations", expected, (24, 24), (1,), ("lamp_on",), "front")
+        assert learned_from(data, use_keypoints=True) == expected
         assert learned_from(data, use_keypoints=False).keypoints == "none"
     assert learned_from_oxe(OxeConfig(mixture=("viola",)), [1, 2, 1]) == LearnedFrom(
         "oxe", "none", (224, 224), (1, 2), ("viola",)

@@ -15,9 +15,10 @@ import tyro
 
 from dsvla_jax import policy as policies
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.errors import UserError
 from dsvla_jax.perception.grounding import GroundingOptions
-from dsvla_jax.policy import LearnedFrom, PolicyConfig
+from dsvla_jax.policy import PolicyConfig
 from dsvla_jax.serving.server import Limits, Perception, PolicyServer, require_range
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.training.experiment import load_experiment

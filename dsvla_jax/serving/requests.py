@@ -175,7 +175,7 @@ def _parse(message: Any, expected: Expected) -> Request:
         if not 1 <= keypoints.shape[1] <= MAX_KEYPOINTS:
             raise BadRequest(f"keypoints: expected {OPTIONAL_FIELDS['keypoints']}, got K = {keypoints.shape[1]}")
         _check_inside("keypoints", keypoints, expected.codec)
-    observation = Observation(rgb=rgb, depth=depth, camera=camera, pose=unit_pose, gripper_open=gripper_open)
+    observation = Observation(rgb=message["rgb"], depth=depth, camera=camera, pose=unit_pose, gripper_open=gripper_open)
     return Request(instruction, observation, keypoints, bool(reset), points)
 
 

@@ -49,8 +49,9 @@ class Session:
     def advance(self, request: Request, keypoints: np.ndarray) -> tuple[np.ndarray, Progress]:
         """The active one of each arm's keypoints (A, K, 3), float32 (A, 3), and the progress to `keep` with it."""
         shape = keypoints.shape[:2]
-        fresh = self._progress is None or self.begins(request, keypoints)
-        before = np.zeros(shape[0], np.int32) if fresh else self._progress.reached
+        before = np.zeros(shape[0], np.int32)
+        if self._progress is not None and not self.begins(request, keypoints):
+            before = self._progress.reached
         positions = np.asarray(request.observation.pose)[:, :3]
         reached = np.asarray(advance_latch(before, positions, keypoints))
         active = [active_keypoint(count, row) for count, row in zip(reached, keypoints, strict=True)]
