@@ -24,6 +24,7 @@ import tyro
 import dsvla_jax.policy
 from configs import config_names, get_config
 from data_pipelines.first_look import fit_workspace, look_at_demonstrations, look_at_mixture
+from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.loader import make_loader
 from data_pipelines.samples import make_sampler, make_validation_sampler, suite_tokenizer
 from data_pipelines.sources import choose_tasks, open_demonstrations, open_held_out
@@ -115,7 +116,11 @@ def train(
     report_size(state.trainable, frozen, samples)
 
     save_experiment(run / "config.json", experiment)
-    save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model, displacement), tokenizer)
+    if experiment.oxe is None:
+        learned = learned_from(experiment.data, experiment.encoding.use_keypoints)
+    else:
+        learned = learned_from_oxe(experiment.oxe, [len(item.dataset.arms) for item in batches.source.datasets])
+    save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model, displacement, learned), tokenizer)
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
         restored = checkpoints.restore(loop.arrays_of(state))

@@ -4,7 +4,7 @@
     PYTHONPATH=CLIENT python -m benchmarks.serving_openpi [RUN] [--episodes 4]
 
 Without its dependencies, because it pins NumPy 1; it runs with NumPy 2 all the same. Exits with 77 where it is missing,
-and with 1 unless an episode of every task for one arm succeeds, and as many as without a server.
+and with 1 unless an episode of every task succeeds, and as many as without a server.
 """
 
 import dataclasses
@@ -18,11 +18,12 @@ import dsvla_jax.policy
 from benchmarks._server import server_process
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.rollout import run_episodes
+from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.sim.tasks import get_task, select_tasks
+from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import load_experiment
-from examples.robot_client import SimulatedRobot, run_episode
+from examples.robot_client import run_episode, simulated_robot
 
 NO_CLIENT = 77
 
@@ -41,22 +42,23 @@ def main(options: Options) -> int:
     except ModuleNotFoundError as error:
         print(f"no openpi-client ({error}); see the top of {__file__}", file=sys.stderr)
         return NO_CLIENT
-    data, enough = load_experiment(options.run / "config.json").data, True
+    experiment, enough = load_experiment(options.run / "config.json"), True
+    data = experiment.data
     policy = dsvla_jax.policy.load(options.run)
-    with server_process(options.run, "--batch", "1", "--arms", "1") as (port, _):
+    with server_process(options.run, "--batch", "1") as (port, _):
         for name in select_tasks(data.tasks):
-            if get_task(name).num_arms != 1:
-                continue
             remote = []
             for seed in range(options.episodes):
                 client = WebsocketClientPolicy("127.0.0.1", port)
-                robot = SimulatedRobot(name, data.image_size, seed)
+                robot = simulated_robot(client.get_server_metadata(), name, seed)
                 limit = 2 * robot.environment.expert_keyframes
                 remote.append(run_episode(client, robot, robot.prompt, limit))
                 client._ws.close()
             environment = Environment(name, image_size=data.image_size)
             state = environment.reset(episode_keys(0, "eval", name, 0, options.episodes))
-            local = [ending.success for ending in run_episodes(environment, policy.act, state)]
+            make = keypoint_source(experiment.keypoints, environment)
+            endings = run_episodes(environment, policy.act, state, find_keypoints=make and make(state))
+            local = [ending.success for ending in endings]
             print(f"{name}: {sum(remote)} of {options.episodes} through the server, {sum(local)} without", flush=True)
             enough &= any(remote) and bool(np.array_equal(remote, local))
     return int(not enough)

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import errno
 import os
+import socket
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,6 +12,8 @@ from pathlib import Path
 import jax
 
 from dsvla_jax.errors import UserError
+
+_UNREACHABLE = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH)
 
 
 @contextlib.contextmanager
@@ -22,6 +25,10 @@ def fail_with_message() -> Iterator[None]:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
     except OSError as error:
+        if error.errno in _UNREACHABLE or isinstance(error, socket.gaierror):
+            fix = "check its address, and that it runs and can be reached from here"
+            print(f"error: no connection to the other machine or program: {error.strerror}; {fix}", file=sys.stderr)
+            sys.exit(1)
         # Without a file's name it is no file that a user named, unless the disk is full.
         if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise

@@ -86,6 +86,24 @@ class OxeConfig:
         _require(self.unlabelled in choices, "unlabelled", "leave_out, keep or refuse", repr(self.unlabelled))
 
 
+@dataclasses.dataclass(frozen=True)
+class LearnedFrom:
+    """What a policy saw in training, which is what it must be asked with."""
+
+    source: Literal["simulator", "demonstrations", "oxe"]
+    """The task suite, imported or own demonstrations, or Open X-Embodiment."""
+    keypoints: Literal["none", "oracle", "segmentation", "recorded"]
+    """none: prompts without them. oracle: the task's own. segmentation: found in the first picture with the simulator's
+    masks. recorded: those of the demonstrations."""
+    image_size: tuple[int, int]
+    """Height and width of the pictures, pixels."""
+    arms: tuple[int, ...]
+    """The numbers of arms."""
+    tasks: tuple[str, ...] = ()
+    camera: str = ""
+    """The camera's name; empty if the data do not say."""
+
+
 def _require(holds: bool, field: str, expected: str, got: float | str) -> None:
     if not holds:
         raise UserError(f"{field}: expected {expected}, got {got}")

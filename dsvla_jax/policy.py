@@ -15,13 +15,15 @@ import numpy as np
 from flax import struct
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer
 from dsvla_jax.encoding.prompts import format_answer
-from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.encoding.text import Tokenizer, quoted, unknown_words
+from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
 from dsvla_jax.model.layers_apart import take_apart
@@ -39,6 +41,14 @@ class PolicyConfig:
     model: ModelConfig
     displacement: DisplacementScale | None = None
     """The range of answers that say where to go from the present pose; None for answers that are poses."""
+    learned_from: LearnedFrom | None = None
+    """None for runs of versions that did not keep it."""
+
+    @property
+    def wants_keypoints(self) -> bool:
+        """Whether prompts state a keypoint, because those of training did."""
+        seen = self.learned_from is None or self.learned_from.keypoints != "none"
+        return self.encoding.use_keypoints and seen
 
 
 # Batches are filled up to one of these sizes, so that any size runs without compiling again; beyond, to a multiple of
@@ -99,8 +109,13 @@ class Policy:
         """The question of one robot as tokens int32 (T,) and their mask bool (T,), see `encode_text`.
 
         pose: (A, 7). gripper_open: (A,). keypoints: (A, 3), the active ones, or None.
-        Raises ValueError where the instruction is too long or has a number that no token stands for.
+        Raises UserError if the instruction has a word or number that no token stands for, ValueError if it is too long.
         """
+        if unknown := unknown_words([instruction], self.tokenizer):
+            raise UserError(
+                f"the policy's vocabulary has no token for {quoted(unknown)}; expected words that the policy "
+                "was trained with"
+            )
         encoding = self.config.encoding
         prompt = build_prompt(encoding, instruction, pose, gripper_open, keypoints)
         return encode_text(self.tokenizer, prompt, None, encoding.max_text_length)[:2]

@@ -6,15 +6,24 @@ Start a server first: python -m dsvla_jax.serving RUN. For your own robot write 
 
 import dataclasses
 import sys
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Literal, Protocol
 
+import jax
 import numpy as np
 import tyro
 
+# In a fresh clone nothing is installed, and a script's own folder is the only one that Python searches.
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.errors import UserError
+from dsvla_jax.observation_checks import MAX_DEPTH
+from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.serving.client import PolicyClient
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.types import Action
 
 
@@ -35,25 +44,40 @@ class Robot(Protocol):
 
 
 class SimulatedRobot:
-    """One episode of a task in C MuJoCo, from a start that no demonstration has."""
+    """One episode of a task in C MuJoCo, from a start that no demonstration has.
 
-    def __init__(self, task: str, image_size: int, seed: int):
+    keypoints: those that the policy learned with: found in the first picture with the simulator's masks
+        (segmentation), the task's own (oracle), or none.
+    """
+
+    def __init__(self, task: str, image_size: int, seed: int, keypoints: Literal["segmentation", "oracle", "none"]):
         self.environment = Environment(task, image_size=image_size)
         self._state = self.environment.reset(episode_keys(0, "eval", task, seed, 1))
         self.prompt = self.environment.instructions(self._state, seed)[0]
-        self._keypoints = np.asarray(self.environment.keypoints(self._state))[0]
+        self._kind, self._find = keypoints, None
+        if keypoints == "segmentation":
+            make = keypoint_source(keypoints, self.environment)
+            self._find = make and make(self._state)
+        self._own = np.asarray(self.environment.keypoints(self._state))[0]
 
     def observe(self) -> dict[str, Any]:
         seen = self.environment.observe(self._state)
-        return {
-            "rgb": np.asarray(seen.rgb)[0],
-            "depth": np.asarray(seen.depth)[0],
-            "intrinsics": np.asarray(seen.camera.intrinsics)[0],
-            "world_from_camera": np.asarray(seen.camera.world_from_camera)[0],
-            "pose": np.asarray(seen.pose)[0],
-            "gripper_open": np.asarray(seen.gripper_open)[0],
-            "keypoints": self._keypoints,
+        one = jax.tree.map(lambda leaf: np.asarray(leaf)[0], seen)
+        observation = {
+            "rgb": one.rgb,
+            # As in the demonstrations, what is farther than a depth camera sees has no reading.
+            "depth": np.where(one.depth <= MAX_DEPTH, one.depth, 0),
+            "intrinsics": one.camera.intrinsics,
+            "world_from_camera": one.camera.world_from_camera,
+            "pose": one.pose,
+            "gripper_open": one.gripper_open,
         }
+        if self._find is not None:
+            points, (problem,) = self._find(self._state, seen)
+            if problem:
+                raise UserError(problem)
+            return {**observation, "keypoints": points[0]}
+        return observation if self._kind == "none" else {**observation, "keypoints": self._own}
 
     def move(self, pose: np.ndarray, gripper_open: np.ndarray) -> None:
         action = Action(pose=np.asarray(pose)[None], gripper_open=np.asarray(gripper_open)[None])  # type: ignore[arg-type]
@@ -100,18 +124,46 @@ def run_episode(policy: Any, robot: Robot, prompt: str, key_poses: int) -> bool:
     return False
 
 
+def simulated_robot(metadata: dict[str, Any], task: str, seed: int) -> SimulatedRobot:
+    """The robot that sends what the server's policy learned from. Raises UserError if the simulator has none."""
+    (task,) = select_tasks((task,))
+    learned, arms = metadata["learned_from"] or {}, get_task(task).num_arms
+    if learned and learned["source"] != "simulator" and task not in learned["tasks"]:
+        raise UserError(
+            f"{metadata['name']} learned from {learned['source']} ({', '.join(learned['tasks'][:5])}), not in the "
+            "simulator: write a class with `observe` and `move` for your own robot, as SimulatedRobot in this file"
+        )
+    if arms not in metadata["arms"]:
+        known = " or ".join(map(str, metadata["arms"]))
+        raise UserError(f"--task: {task} is for {arms} arm(s), the server's policy for {known}; choose another task")
+    squares = [height for height, width in metadata["image_sizes"] if height == width]
+    if not squares:
+        raise UserError(
+            f"the simulator's pictures are square, and the server takes {metadata['image_sizes']} only; start it with "
+            "--image-size 96x96 besides"
+        )
+    keypoints = learned.get("keypoints", "oracle" if metadata["needs_keypoints"] else "none")
+    return SimulatedRobot(task, squares[0], seed, "oracle" if keypoints == "recorded" else keypoints)
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Which server, and which robot."""
 
     host: str = "127.0.0.1"
+    """The server's machine."""
     port: int = 8000
+    """The server's TCP port."""
     token: str | None = None
+    """What the server's --token-file holds, if it has one."""
     task: str = "lamp_on"
     """The simulated robot's task."""
     seed: int = 0
+    """The number of the episode."""
     key_poses: int = 10
     """After which an episode is over."""
+    timeout: float = 60.0
+    """Seconds to connect, and for each reply."""
     dry_run: bool = False
     """Only say what would be done."""
     longest_move: float = 0.8
@@ -119,9 +171,13 @@ class Options:
 
 
 def main(options: Options) -> int:
-    with PolicyClient(options.host, options.port, options.token) as policy:
-        height, _ = policy.metadata["image_sizes"][0]
-        robot = simulated = SimulatedRobot(options.task, height, options.seed)
+    if options.key_poses < 1 or options.seed < 0 or not options.longest_move > 0:
+        raise UserError(
+            "--key-poses: expected at least 1, --seed at least 0, --longest-move more than 0; got "
+            f"{options.key_poses}, {options.seed}, {options.longest_move}"
+        )
+    with PolicyClient(options.host, options.port, options.token, options.timeout) as policy:
+        robot = simulated = simulated_robot(policy.metadata, options.task, options.seed)
         if options.dry_run:
             low, high = policy.metadata["workspace_low"], policy.metadata["workspace_high"]
             robot = DryRun(simulated, low, high, options.longest_move)

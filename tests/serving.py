@@ -21,10 +21,10 @@ SIZE = 32
 PROMPTS = ("turn on the light", "close the fridge", "lift the ball", "press the red button")
 
 
-def tiny_policy(use_keypoints: bool = True) -> Policy:
+def tiny_policy(use_keypoints: bool = True, use_points: bool = True) -> Policy:
     """Random weights, larger than at initialisation, so that different observations get different answers."""
     tokenizer = WordTokenizer(vocabulary(PROMPTS))
-    encoding = small_encoding(max_text_length=48, use_keypoints=use_keypoints)
+    encoding = small_encoding(max_text_length=48, use_keypoints=use_keypoints, use_points=use_points)
     model = ModelConfig(
         vision=small_vision(),
         language=small_language(tokenizer.vocab_size),

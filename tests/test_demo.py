@@ -13,7 +13,7 @@ from tests.serving import SIZE, observation, tiny_policy
 
 def test_a_turn_is_described_with_its_prompt_and_probabilities():
     policy = tiny_policy()
-    request = parse_request(observation(3), Expected(((SIZE, SIZE),), (1,), policy.codec))
+    request = parse_request(observation(3), Expected(((SIZE, SIZE),), (1,), policy.config.encoding))
     seen = jax.tree.map(lambda x: np.asarray(x)[None], request.observation)
     assert request.keypoints is not None
     near = request.keypoints[:, 0]
@@ -33,7 +33,7 @@ def test_a_turn_is_described_with_its_prompt_and_probabilities():
 
 
 def test_tokens_are_drawn_where_they_are_and_joined_to_their_patch():
-    request = parse_request(observation(0), Expected(((SIZE, SIZE),), (1,), tiny_policy().codec))
+    request = parse_request(observation(0), Expected(((SIZE, SIZE),), (1,), tiny_policy().config.encoding))
     black = np.zeros((SIZE, SIZE, 3), np.uint8)
     # On the camera's axis, hence at the middle of the picture; its patch is the first of 2 x 2.
     camera = jax.tree.map(np.asarray, request.observation.camera)

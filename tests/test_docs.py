@@ -36,10 +36,8 @@ def test_the_example_of_a_new_task_is_one_file_that_is_trained_on(tmp_path):
         shutil.copytree(DOCS.parent / name, tmp_path / name)
     shutil.copy(DOCS.parent / "train.py", tmp_path)
     (tmp_path / "dsvla_jax" / "sim" / "tasks" / "lift_cube.py").write_text(code)
-    options = (
-        "--data.tasks lift_cube --data.episodes 2 --data.image-size 48 --steps 1 --batch-size 2 --model.scan-unroll 1"
-    )
-    command = [sys.executable, "train.py", "tiny", "--run", "run", *options.split()]
+    options = "--data.tasks lift_cube --data.episodes 2 --data.image-size 48 --steps 1"
+    command = [sys.executable, "train.py", *SMALL_RUN.split(), *options.split()]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert ended.returncode == 0, ended.stderr
     episode = EpisodeReader(tmp_path / "data" / "demos").episode(0)

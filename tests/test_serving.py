@@ -3,6 +3,7 @@
 import asyncio
 import concurrent.futures
 import contextlib
+import dataclasses
 import http.client
 import socket
 import struct
@@ -15,12 +16,13 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.geometry.cameras import front_camera, unproject
 from dsvla_jax.perception.keypoints import Sighting
 from dsvla_jax.rollout_keypoints import suite_phrases
 from dsvla_jax.serving.batching import answer_batch
-from dsvla_jax.serving.client import PolicyClient, ServerError
+from dsvla_jax.serving.client import ConnectionFailed, PolicyClient, ServerError
 from dsvla_jax.serving.messages import MAX_CONTAINERS, MessageError, pack, unpack
 from dsvla_jax.serving.requests import BadRequest, parse_request
 from dsvla_jax.serving.server import Perception
@@ -115,6 +117,17 @@ def test_what_is_no_message_is_refused(data):
     assert value.size == 0
 
 
+def in_millimetres(camera):
+    matrix = np.array(camera.world_from_camera)
+    matrix[:3, 3] *= 1000
+    return matrix
+
+
+def upside_down(camera):
+    """With the axes of OpenGL: y up, looking along -z."""
+    return np.asarray(camera.world_from_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
 @pytest.mark.parametrize(
     ("field", "value", "complaint"),
     [
@@ -126,17 +139,31 @@ def test_what_is_no_message_is_refused(data):
         ("rgb", None, "rgb: expected a uint8 array"),
         ("depth", np.ones((SIZE, SIZE), np.uint16), "divide millimetres by 1000"),
         ("depth", np.ones((SIZE, SIZE + 1)), r"depth: .* got shape \(32, 33\)"),
+        ("depth", np.zeros((SIZE, SIZE)), "depth: expected some readings.*check that the depth stream was on"),
+        ("depth", np.full((SIZE, SIZE), np.nan), "depth: expected some readings"),
+        ("depth", np.full((SIZE, SIZE), 1000.0), "depth: expected metres.*divide by 1000"),
+        ("depth", np.full((SIZE, SIZE), -1.0), "depth: expected 0 to"),
+        ("depth", np.pad([[1.2]], ((16, 15), (16, 15))), "depth: expected at least 4 points.*got 1 of 256 pixels"),
+        ("depth", np.full((SIZE, SIZE), 6.0), "readings in the workspace.*got 0 of 256.*in front of the camera"),
         ("intrinsics", np.zeros((3, 3)), "intrinsics: expected"),
+        ("intrinsics", np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1.0]]), "a centre in 32 x 32 pixels"),
+        ("intrinsics", np.array([[-40, 0, 16], [5, -40, 16], [0, 0, 1.0]]), "intrinsics: expected a pinhole"),
+        ("intrinsics", np.array([[-40, 0, 0], [0, -40, 0], [16, 16, 1.0]]), "intrinsics: expected a pinhole"),
+        ("world_from_camera", in_millimetres(front_camera(SIZE)), "world_from_camera: expected a place in metres"),
+        ("world_from_camera", upside_down(front_camera(SIZE)), "readings in the workspace"),
         ("intrinsics", np.eye(4), r"got shape \(4, 4\)"),
         ("world_from_camera", 2 * np.eye(4), "world_from_camera: expected a rotation"),
         ("world_from_camera", np.diag([1.0, 1.0, -1.0, 1.0]), "world_from_camera: expected a rotation"),
         ("pose", np.zeros((2, 7)), "expected 1 arm"),
-        ("pose", [[0.2, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0]], "quaternions x y z w of length 1"),
+        ("pose", [[0.2, 0.0, 1.0, 0.0, 0.0, 0.0, 2.0]], "pose: expected a unit quaternion"),
+        ("pose", [[0.2, 0.0, 1.0, 0.0, 0.0, 0.0, 1.05]], "pose: expected a unit quaternion"),
+        ("pose", [[0.2, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]], "pose: expected a unit quaternion"),
         ("pose", [[200.0, 0.0, 1000.0, 0.0, 0.0, 0.0, 1.0]], "outside the workspace"),
         ("pose", [[np.nan] * 7], "pose: expected finite"),
         ("pose", [[0.2], [0.1, 0.3]], "pose: expected float"),
         ("pose", [["a"] * 7], "pose: expected float"),
         ("gripper_open", np.ones(2), r"gripper_open: .* got shape \(2,\)"),
+        *[("gripper_open", [x], r"gripper_open: expected 0 \(closed\) or 1 \(open\)") for x in (7, -3, 255, 0.08)],
         ("keypoints", np.ones((1, 0, 3)), "K = 0"),
         ("keypoints", np.ones((1, 17, 3)), "K = 17"),
         ("keypoints", np.ones((2, 1, 3)), "keypoints: expected"),
@@ -225,12 +252,56 @@ def test_an_arm_that_has_come_near_its_keypoint_is_sent_to_the_next(client):
     assert client.infer({**request, "prompt": "lift the ball"})["reached"] == [0]
 
 
+def from_above(request: dict) -> dict:
+    """The request with a camera over the table that looks down on all of it but its corners."""
+    turned = np.array([[0, -1, 0, 0.3], [-1, 0, 0, 0.0], [0, 0, -1, 3.3], [0, 0, 0, 1.0]])
+    return {**request, "world_from_camera": turned, "depth": np.full((SIZE, SIZE), 2.0)}
+
+
+def test_a_camera_that_sees_none_of_the_first_keypoints_is_refused(client):
+    down = from_above(observation(1))
+    assert client.infer({**down, "reset": True})["points"] == 256
+    far = {**down, "keypoints": np.tile([-0.9, 0.9, 1.9], (1, 2, 1))}
+    assert client.infer(far)["text"]  # a camera that moves may lose them later
+    with pytest.raises(ServerError, match=r"keypoints: expected one in the first 32 x 32 picture.*not its inverse"):
+        client.infer({**far, "reset": True})
+
+
+def test_a_reply_says_how_many_points_were_used(client):
+    whole, half = observation(2), observation(2)
+    half["depth"] = np.where(np.arange(SIZE) < SIZE // 2, half["depth"], np.inf)
+    counts = [client.infer(request)["points"] for request in (whole, half)]
+    assert 64 < counts[0] <= 256
+    assert 16 < counts[1] < 0.7 * counts[0]
+
+
+def test_a_refused_request_changes_nothing_in_the_episode(client):
+    request = observation(1)
+    first, second = request["keypoints"][0]
+    near = {**request, "pose": np.concatenate([first + 0.02, request["pose"][0, 3:]])[None]}
+    assert client.infer(near)["keypoint"] == [second.tolist()]
+    for bad in (
+        {"prompt": "turn on the lihgt"},
+        {"prompt": "the " * 40},
+        {"depth": np.zeros((SIZE, SIZE))},
+        {**from_above(request), "keypoints": np.tile([-0.9, 0.9, 1.9], (1, 3, 1))},
+    ):
+        with pytest.raises(ServerError, match=":"):
+            client.infer({**request, **bad})
+    assert client.infer(request)["reached"] == [1]
+
+
 def test_a_bad_request_gets_an_error_and_the_connection_goes_on(client):
     for bad, complaint in (
         ({}, "missing"),
         ({**observation(0), "rgb": 3}, "rgb: expected"),
         ({**observation(0), "keypoints": None}, "trained with them"),
-        ({**observation(0), "prompt": "stack 999 blocks"}, "number 999 has no token"),
+        ({**observation(0), "prompt": "press 450"}, "no token for '450'"),
+        ({**observation(0), "prompt": "press ②"}, "no token for '②'"),
+        ({**observation(0), "prompt": "turn on the lihgt"}, "no token for 'lihgt'"),
+        ({**observation(0), "prompt": "xyzzy frobnicate"}, "no token for 'frobnicate', 'xyzzy'"),
+        ({**observation(0), "prompt": "打开灯"}, "no token for '打开灯'"),
+        ({**observation(0), "prompt": "\u202d"}, "no token for"),
         ({**observation(0), "prompt": "the " * 100}, "max_text_length"),
     ):
         with pytest.raises(ServerError, match=complaint):
@@ -238,12 +309,35 @@ def test_a_bad_request_gets_an_error_and_the_connection_goes_on(client):
     assert client.infer(observation(0))["text"]
 
 
-def test_a_policy_without_keypoints_needs_none():
-    with running(lambda: small_server(tiny_policy(use_keypoints=False), limits={"batch": 1})) as (_, port):
+def test_a_policy_without_keypoints_and_3d_input_needs_neither():
+    policy = tiny_policy(use_keypoints=False, use_points=False)
+    with running(lambda: small_server(policy, limits={"batch": 1})) as (_, port), PolicyClient(port=port) as client:
+        assert set(client.metadata["request"]) == {"prompt", "rgb", "pose", "gripper_open"}
         request = observation(0)
+        with_depth = client.infer(request)
+        for name in ("keypoints", "depth", "intrinsics", "world_from_camera"):
+            del request[name]
+        reply = client.infer(request)
+        assert (reply["keypoint"], reply["points"]) == (None, None)
+        assert reply["text"] == with_depth["text"]
+        with pytest.raises(ServerError, match=r"missing \['intrinsics', 'world_from_camera'\]"):
+            client.infer({**request, "depth": np.ones((SIZE, SIZE))})
+
+
+def test_a_policy_that_learned_without_keypoints_refuses_them():
+    small = tiny_policy()
+    learned = LearnedFrom("demonstrations", "none", (SIZE, SIZE), (1,), ("lift_box",), "wrist")
+    policy = dataclasses.replace(small, config=dataclasses.replace(small.config, learned_from=learned))
+    with running(lambda: small_server(policy, limits={"batch": 1})) as (_, port), PolicyClient(port=port) as client:
+        assert client.metadata["needs_keypoints"] is False
+        assert client.metadata["learned_from"]["keypoints"] == "none"
+        assert client.metadata["learned_from"]["image_size"] == [SIZE, SIZE]
+        assert client.metadata["vocabulary"] == "words of the training data"
+        request = observation(0)
+        with pytest.raises(ServerError, match="keypoints: this policy learned from demonstrations without any"):
+            client.infer(request)
         del request["keypoints"]
-        with PolicyClient(port=port) as client:
-            assert client.infer(request)["keypoint"] is None
+        assert client.infer(request)["keypoint"] is None
 
 
 def test_keypoints_are_found_in_the_picture_of_a_robot_that_sends_none(policy):
@@ -272,8 +366,8 @@ def test_keypoints_are_found_in_the_picture_of_a_robot_that_sends_none(policy):
         assert client.infer(dark)["keypoint"] == [point]
         with pytest.raises(ServerError, match="it is dark"):
             client.infer({**dark, "reset": True})
-        with pytest.raises(ServerError, match="no object phrases for the instruction 'sing'"):
-            client.infer({**lit, "prompt": "sing"})
+        with pytest.raises(ServerError, match="no object phrases for the instruction 'lift'"):
+            client.infer({**lit, "prompt": "lift"})
 
 
 def test_messages_with_bytes_changed_are_answered_or_refused_and_nothing_else(running_server):
@@ -305,7 +399,7 @@ def test_health_and_metrics(running_server):
 def test_a_token_keeps_others_out(policy):
     with running(lambda: small_server(policy, token="secret", limits={"batch": 1})) as (_, port):
         for wrong in (None, "other"):
-            with pytest.raises(InvalidStatus, match="401"):
+            with pytest.raises(ConnectionFailed, match=r"HTTP status 401 .*--token-file"):
                 PolicyClient(port=port, token=wrong)
         assert get(port, "/metrics")[0] == 401
         assert get(port, "/metrics", Authorization="Bearer secret")[0] == 200
@@ -328,7 +422,7 @@ def test_web_pages_are_kept_out(running_server):
 
 def test_more_robots_than_the_limit_are_turned_away(policy):
     with running(lambda: small_server(policy, limits={"batch": 1, "clients": 1})) as (_, port):
-        with PolicyClient(port=port), pytest.raises(InvalidStatus, match="503"):
+        with PolicyClient(port=port), pytest.raises(ConnectionFailed, match=r"HTTP status 503 \(1 robots .*--clients"):
             PolicyClient(port=port)
         ask(port, 0)
 

@@ -7,7 +7,8 @@ import pytest
 
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.prompts import ParseFailure, answer_pieces, format_answer, format_prompt, parse_answer
-from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.encoding.text import WordTokenizer, check_words, unknown_words, vocabulary
+from dsvla_jax.errors import UserError
 from dsvla_jax.types import Action
 
 ARMS_AND_STYLES = [(arms, style) for arms in (1, 2) for style in ("paper", "compact")]
@@ -178,3 +179,19 @@ def test_word_tokenizer_does_not_depend_on_the_order_of_instructions_and_survive
     (tmp_path / "other.json").write_text(json.dumps({"words": []}))
     with pytest.raises(ValueError, match=r"other\.json: expected .*format"):
         WordTokenizer.load(tmp_path / "other.json")
+
+
+def test_words_and_numbers_without_a_token_are_named_and_digits_that_are_no_integers_are_words(tokenizer):
+    text = "Close the red JAR, lift 2 trays to 450 or -101 degrees: ② ³ ٣ 0007"
+    assert unknown_words([text], tokenizer) == ["-101", "450", "degrees", "to", "trays", "³", "②"]
+    assert unknown_words(["close 200 -100 -0 ٣ 0007"], tokenizer) == []
+    assert tokenizer.encode("٣ 0007") == tokenizer.encode("3 7")
+    assert unknown_words(["9" * 5000], tokenizer) == ["9" * 5000]
+    assert WordTokenizer(vocabulary(["press button ②"])).encode("②") != [tokenizer.unk_id]
+    with pytest.raises(UserError, match=r"mine: .*no token for '450': integers from -100 to 200 .*in words"):
+        check_words("mine", ["set the oven to 450 degrees"], tokenizer, "command")
+    with pytest.raises(UserError, match=r"mine: .*no token for 'frobnicate', 'xyzzy'; write one with `command`"):
+        check_words("mine", ["xyzzy frobnicate"], tokenizer, "command")
+    for text in ("close 450", "9" * 5000):
+        with pytest.raises(UserError, match="has no token"):
+            tokenizer.encode(text)

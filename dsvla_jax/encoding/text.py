@@ -113,6 +113,11 @@ class WordTokenizer:
         values[first : first + count] = np.arange(LOWEST_NUMBER, HIGHEST_NUMBER + 1)
         return values
 
+    def knows(self, word: str) -> bool:
+        """Whether a word, sign or number of `split_words` has a token of its own."""
+        # As a float, since `int` refuses thousands of digits.
+        return word in self._ids or (_is_number(word) and LOWEST_NUMBER <= float(word) <= HIGHEST_NUMBER)
+
     def encode(self, text: str) -> list[int]:
         ids = self._ids
         return [ids[word] if word in ids else self._encode_word(word, text) for word in split_words(text)]
@@ -142,31 +147,40 @@ class WordTokenizer:
     def _encode_word(self, word: str, text: str) -> int:
         if not _is_number(word):
             return self.unk_id
-        number = str(int(word))
-        if number not in self._ids:
-            raise ValueError(
+        if not self.knows(word):
+            raise UserError(
                 f"number {word} has no token: integers from {LOWEST_NUMBER} to {HIGHEST_NUMBER} have one; in {text!r}"
             )
-        return self._ids[number]
+        return self._ids[str(int(word))]
 
 
 def unknown_words(texts: Iterable[str], tokenizer: Tokenizer) -> list[str]:
-    """The words of the texts that would become <unk>, sorted; a subword tokenizer knows every word."""
+    """The words and numbers of the texts that have no token, sorted; a subword tokenizer knows every one."""
     if not isinstance(tokenizer, WordTokenizer):
         return []
-    words = {word for text in texts for word in split_words(text) if not word.lstrip("-").isdigit()}
-    return sorted(words - set(tokenizer.words))
+    return sorted({word for text in texts for word in split_words(text) if not tokenizer.knows(word)})
 
 
 def check_words(where: object, texts: Iterable[str], tokenizer: Tokenizer, command: str) -> None:
-    """Raises UserError if a word of a text would become <unk>. command: what writes a vocabulary that has it."""
-    if unknown := unknown_words(texts, tokenizer):
-        some = ", ".join(map(repr, unknown[:5])) + (f" and {len(unknown) - 5} more" if len(unknown) > 5 else "")
+    """Raises UserError if a word or number of a text has no token. command: what writes a vocabulary with the words."""
+    unknown = unknown_words(texts, tokenizer)
+    if numbers := [word for word in unknown if _is_number(word)]:
         raise UserError(
-            f"{where}: the vocabulary has no token for {some}; write one with `{command}`, and train with the options"
-            " that it prints"
+            f"{where}: the vocabulary has no token for {quoted(numbers)}: integers from {LOWEST_NUMBER} to "
+            f"{HIGHEST_NUMBER} have one; write other numbers in words, or use a language model with its own tokenizer"
+        )
+    if unknown:
+        raise UserError(
+            f"{where}: the vocabulary has no token for {quoted(unknown)}; write one with `{command}`, and train with"
+            " the options that it prints"
         )
 
 
+def quoted(words: Sequence[str]) -> str:
+    """The first five words in quotation marks, and how many more there are."""
+    return ", ".join(map(repr, words[:5])) + (f" and {len(words) - 5} more" if len(words) > 5 else "")
+
+
 def _is_number(word: str) -> bool:
-    return word.lstrip("-").isdigit()
+    # Decimal digits only, as in `split_words`: "²" and "②" are digits too, but `int` does not read them.
+    return word.lstrip("-").isdecimal()

@@ -60,15 +60,16 @@ def prompt_length(policy: Policy, arms: int, instruction_tokens: int) -> int:
     pose = np.tile(
         np.array([*policy.codec.low[:2], policy.codec.high[2], -0.5, -0.5, -0.5, 0.5], np.float32), (arms, 1)
     )
-    _, mask = policy.encode_prompt("", pose, np.ones(arms, np.float32), pose[:, :3])
+    keypoints = pose[:, :3] if policy.config.wants_keypoints else None
+    _, mask = policy.encode_prompt("", pose, np.ones(arms, np.float32), keypoints)
     return min(policy.config.encoding.max_text_length, int(mask.sum()) + instruction_tokens)
 
 
 def answer_batch(policy: Policy, questions: Sequence[Question], prompt_tokens: int | None = None) -> list[Answer]:
     """Answers questions of one shape together, their prompts padded to ``prompt_tokens``."""
     observation = jax.tree.map(lambda *leaves: np.stack(leaves), *[question.observation for question in questions])
-    with_keypoints = policy.config.encoding.use_keypoints
-    keypoints = np.stack([np.asarray(question.keypoints) for question in questions]) if with_keypoints else None
+    wanted = policy.config.wants_keypoints
+    keypoints = np.stack([np.asarray(question.keypoints) for question in questions]) if wanted else None
     instructions = [question.instruction for question in questions]
     decision = policy.decide(observation, instructions, keypoints, prompt_tokens=prompt_tokens)
     poses, grippers = np.asarray(decision.action.pose), np.asarray(decision.action.gripper_open)
@@ -88,7 +89,7 @@ def blank_question(arms: int, height: int, width: int) -> Question:
         pose=pose,  # type: ignore[arg-type]
         gripper_open=np.ones(arms, np.float32),  # type: ignore[arg-type]
     )
-    return Question("wait", observation, pose[:, :3])
+    return Question("", observation, pose[:, :3])
 
 
 class MicroBatcher:

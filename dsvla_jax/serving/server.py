@@ -25,7 +25,7 @@ from websockets.http11 import Response
 from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import KeypointTracker, Segmenter
 from dsvla_jax.perception.phrases import ObjectPhrases, phrases_for
-from dsvla_jax.policy import Policy
+from dsvla_jax.policy import BATCH_SIZES, Policy
 from dsvla_jax.serving.batching import (
     Answer,
     MicroBatcher,
@@ -37,9 +37,18 @@ from dsvla_jax.serving.batching import (
     prompt_length,
 )
 from dsvla_jax.serving.messages import pack, unpack
+from dsvla_jax.serving.metadata import describe
 from dsvla_jax.serving.metrics import Metrics
-from dsvla_jax.serving.requests import FIELDS, OPTIONAL_FIELDS, BadRequest, Expected, Request, parse_request
-from dsvla_jax.serving.session import Session
+from dsvla_jax.serving.requests import (
+    OPTIONAL_FIELDS,
+    BadRequest,
+    Expected,
+    Request,
+    check_first_keypoints,
+    parse_request,
+)
+from dsvla_jax.serving.session import Progress, Session
+from dsvla_jax.types import TABLE_HEIGHT
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +71,18 @@ class Limits:
     """For a message to arrive once it has begun; a silent peer is asked for a sign of life as often."""
     idle_seconds: float = 3600.0
     """Between two requests of a robot."""
+
+    def __post_init__(self) -> None:
+        for field, most in (("clients", 10_000), ("batch", BATCH_SIZES[-1]), ("instruction_tokens", 100_000)):
+            require_range(field, getattr(self, field), 1, most)
+        for field in ("request_seconds", "message_seconds", "idle_seconds"):
+            require_range(field, getattr(self, field), 0.001, 1e9)
+
+
+def require_range(option: str, value: float, low: float, high: float) -> None:
+    """Raises UserError unless the option's value is from ``low`` to ``high``."""
+    if not low <= value <= high:
+        raise UserError(f"--{option.replace('_', '-')}: expected {low:g} to {high:g}, got {value}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +115,14 @@ class PolicyServer:
         perception: Perception | None = None,
     ):
         self.limits = limits or Limits()
-        self.expected = Expected(tuple(image_sizes), tuple(arms), policy.codec)
+        encoding = policy.config.encoding
+        self.expected = Expected(
+            tuple(image_sizes),
+            tuple(arms),
+            encoding,
+            keypoints=policy.config.wants_keypoints or not encoding.use_keypoints,
+            depth=encoding.use_points or perception is not None,
+        )
         self.metrics = Metrics()
         self._policy, self._token, self._name = policy, token, name
         self._prompt_tokens = {n: prompt_length(policy, n, self.limits.instruction_tokens) for n in arms}
@@ -106,24 +134,7 @@ class PolicyServer:
     @property
     def metadata(self) -> dict[str, Any]:
         """What a robot is told on connecting."""
-        return {
-            "name": self._name,
-            "request": FIELDS,
-            "optional": OPTIONAL_FIELDS,
-            "reply": {
-                "actions": "float32 (1, A * 8): the next key pose, x y z qx qy qz qw gripper_open of each arm",
-                "text": "the policy's answer",
-                "log_probs": "of each of its numbers, 8 an arm",
-                "keypoint": "the active keypoint of each arm, metres, world frame, or None",
-                "reached": "how many keypoints each arm has reached",
-            },
-            "needs_keypoints": self._policy.config.encoding.use_keypoints and self._perception is None,
-            "image_sizes": [list(size) for size in self.expected.image_sizes],
-            "arms": list(self.expected.arms),
-            "workspace_low": list(self.expected.codec.low),
-            "workspace_high": list(self.expected.codec.high),
-            "max_message_bytes": self.expected.max_message_bytes,
-        }
+        return describe(self._name, self._policy, self.expected, self._perception is not None)
 
     @contextlib.asynccontextmanager
     async def listen(self, host: str = "127.0.0.1", port: int = 8000):
@@ -159,6 +170,7 @@ class PolicyServer:
     async def _warm_up(self) -> None:
         # From the largest on: what does not fit into memory shows first.
         sizes = batch_sizes(self.limits.batch)[::-1]
+        self._warm_up_checks()
         log.info("compiling for batches of %s", ", ".join(map(str, sizes)))
         for arms in self.expected.arms:
             for height, width in self.expected.image_sizes:
@@ -170,6 +182,11 @@ class PolicyServer:
                         "%d arm(s), %d x %d pixels, batch of %d: compiled in %.1f s",
                         *(arms, height, width, size, time.monotonic() - started),
                     )
+
+    def _warm_up_checks(self) -> None:
+        for arms in self.expected.arms:
+            blank = Request("", blank_question(arms, *self.expected.image_sizes[0]).observation, None, True)
+            check_first_keypoints(blank, np.full((arms, 1, 3), (0.3, 0.0, TABLE_HEIGHT), np.float32))
 
     def _http(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
         """Answers what is not a websocket; None lets a websocket in."""
@@ -252,9 +269,10 @@ class PolicyServer:
         try:
             if isinstance(message, str):
                 raise BadRequest("expected a binary frame of msgpack, got a text frame")
-            request = parse_request(unpack(message), self.expected)
             async with asyncio.timeout(self.limits.request_seconds):
-                question, reached = await self._question(request, session)
+                # In a thread, so that large pictures hold up nobody else's connection.
+                request = await asyncio.to_thread(lambda: parse_request(unpack(message), self.expected))
+                question, progress = await self._question(request, session)
                 answer, timing = await self._batcher.ask(question)
         except UserError as error:
             return "bad", str(error)
@@ -266,15 +284,25 @@ class PolicyServer:
             return "failed", "internal error: the policy failed on this request; the server's log says why"
         self.metrics.answering.observe(timing.answering)
         self.metrics.batch.observe(timing.batch)
-        return "answered", pack(_reply_map(question, answer, timing, reached, previous))
+        reached = None if progress is None else progress.reached
+        return "answered", pack(_reply_map(question, answer, timing, reached, request.points, previous))
 
-    async def _question(self, request: Request, session: Session) -> tuple[Question, np.ndarray | None]:
+    async def _question(self, request: Request, session: Session) -> tuple[Question, Progress | None]:
         """The request as the policy is asked it. What the policy would refuse is refused here, for one robot alone."""
-        keypoints = reached = None
-        if self._policy.config.encoding.use_keypoints:
-            keypoints, reached = session.advance(request, await self._all_keypoints(request, session))
-        observation = request.observation
-        pose, gripper_open = np.asarray(observation.pose), np.asarray(observation.gripper_open)
+        keypoints = progress = None
+        self._check_prompt(request, None)  # before anything is looked for in the picture
+        if self._policy.config.wants_keypoints:
+            known = await self._all_keypoints(request, session)
+            if session.begins(request, known):
+                await asyncio.to_thread(check_first_keypoints, request, known)
+            keypoints, progress = session.advance(request, known)
+            self._check_prompt(request, keypoints)
+            session.keep(progress)
+        return Question(request.instruction, request.observation, keypoints), progress
+
+    def _check_prompt(self, request: Request, keypoints: np.ndarray | None) -> None:
+        """Raises BadRequest if the policy does not know a word, or the prompt is longer than what is compiled."""
+        pose, gripper_open = np.asarray(request.observation.pose), np.asarray(request.observation.gripper_open)
         try:
             _, mask = self._policy.encode_prompt(request.instruction, pose, gripper_open, keypoints)
         except ValueError as error:
@@ -285,7 +313,6 @@ class PolicyServer:
                 f"prompt: {tokens} tokens with pose and keypoints are more than the {most} that the server is compiled "
                 "for; shorten it, or start the server with more --instruction-tokens"
             )
-        return Question(request.instruction, observation, keypoints), reached
 
     async def _all_keypoints(self, request: Request, session: Session) -> np.ndarray:
         """float32 (A, K, 3), those that the robot sent or those that are seen."""
@@ -309,7 +336,12 @@ class _TooManyFragments(Exception):
 
 
 def _reply_map(
-    question: Question, answer: Answer, timing: Timing, reached: np.ndarray | None, previous: float | None
+    question: Question,
+    answer: Answer,
+    timing: Timing,
+    reached: np.ndarray | None,
+    points: int | None,
+    previous: float | None,
 ) -> dict[str, Any]:
     # Arrays have the length of an action chunk in front, because openpi's ActionChunkBroker indexes every array by it.
     server_timing = {
@@ -325,5 +357,6 @@ def _reply_map(
         "log_probs": answer.log_probs,
         "keypoint": None if question.keypoints is None else question.keypoints.tolist(),
         "reached": None if reached is None else reached.tolist(),
+        "points": points,
         "server_timing": server_timing,
     }

@@ -1,5 +1,6 @@
 """What the server remembers of one connection: its keypoints, and how many each arm has reached in this episode."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,34 +10,53 @@ from dsvla_jax.perception.keypoints import KeypointTracker
 from dsvla_jax.serving.requests import Request
 
 
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Of an episode. shape: (A, K) of its keypoints. reached: int32 (A,), how many of them each arm has reached."""
+
+    instruction: str
+    shape: tuple[int, ...]
+    reached: np.ndarray
+
+
 class Session:
     """The keypoint constraint in time, for one robot.
 
-    An episode begins with the connection, with ``reset``, and where the instruction or the number of keypoints changes.
+    An episode begins with the connection, with ``reset``, and when the instruction or the number of keypoints changes.
+    A request that is refused changes nothing: progress counts once it is given to `keep`.
     tracker: finds keypoints in pictures, for a robot that sends none.
     """
 
     def __init__(self, tracker: KeypointTracker | None = None) -> None:
         self._tracker = tracker
-        self._instruction: str | None = None
-        self._shape: tuple[int, ...] = ()
-        self._reached = np.zeros(0, np.int32)
+        self._progress: Progress | None = None
 
     def look(self, request: Request, arms: Sequence[Sequence[str]]) -> np.ndarray:
         """The keypoints (A, K, 3) of the phrases for each arm, seen in this picture or before in the episode."""
         if self._tracker is None:
             raise ValueError("Session.look: made without a tracker")
-        if request.reset or request.instruction != self._instruction:
+        if request.reset or self._progress is None or request.instruction != self._progress.instruction:
             self._tracker.reset()
         seen = request.observation
         return self._tracker.keypoints(np.asarray(seen.rgb), np.asarray(seen.depth), seen.camera, arms)
 
-    def advance(self, request: Request, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The active one of each arm's keypoints (A, K, 3), float32 (A, 3), and how many it has reached, int32 (A,)."""
+    def begins(self, request: Request, keypoints: np.ndarray) -> bool:
+        """Whether an episode begins with this request and its keypoints (A, K, 3)."""
+        known = self._progress
+        same = known is not None and (known.instruction, known.shape) == (request.instruction, keypoints.shape[:2])
+        return request.reset or not same
+
+    def advance(self, request: Request, keypoints: np.ndarray) -> tuple[np.ndarray, Progress]:
+        """The active one of each arm's keypoints (A, K, 3), float32 (A, 3), and the progress to `keep` with it."""
         shape = keypoints.shape[:2]
-        if request.reset or request.instruction != self._instruction or shape != self._shape:
-            self._instruction, self._shape, self._reached = request.instruction, shape, np.zeros(shape[0], np.int32)
+        before = np.zeros(shape[0], np.int32)
+        if self._progress is not None and not self.begins(request, keypoints):
+            before = self._progress.reached
         positions = np.asarray(request.observation.pose)[:, :3]
-        self._reached = np.asarray(advance_latch(self._reached, positions, keypoints))
-        active = [active_keypoint(count, row) for count, row in zip(self._reached, keypoints, strict=True)]
-        return np.stack([np.asarray(point) for point in active]), self._reached
+        reached = np.asarray(advance_latch(before, positions, keypoints))
+        active = [active_keypoint(count, row) for count, row in zip(reached, keypoints, strict=True)]
+        return np.stack([np.asarray(point) for point in active]), Progress(request.instruction, shape, reached)
+
+    def keep(self, progress: Progress) -> None:
+        """Takes over the progress of a request that is answered."""
+        self._progress = progress
