@@ -4,9 +4,12 @@ import contextlib
 import ctypes
 import errno
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 
 import jax
 
@@ -32,6 +35,36 @@ def fail_with_message() -> Iterator[None]:
     except KeyboardInterrupt:
         print("stopped; nothing that was finished is lost", file=sys.stderr)
         sys.exit(130)
+
+
+class _Ended(SystemExit):
+    """SIGTERM came."""
+
+
+@contextlib.contextmanager
+def ended_by_sigterm(kept: str) -> Iterator[None]:
+    """Within the block SIGTERM raises SystemExit, so that what the block began is ended too; a second one kills.
+
+    The status is 75, as of a run that saved and stopped: schedulers may requeue. kept: said to people. Does nothing
+    outside of the main thread, or in a job of several processes, whose SIGTERM JAX's preemption service notes.
+    """
+    if threading.current_thread() is not threading.main_thread() or jax.distributed.is_initialized():
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        raise _Ended(os.EX_TEMPFAIL)
+
+    previous = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    except _Ended:
+        print(f"SIGTERM: {kept}", file=sys.stderr)
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def cache_folder() -> Path:
