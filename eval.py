@@ -19,6 +19,7 @@ import tyro
 import dsvla_jax.policy
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import write_picture
 from dsvla_jax.model.decode import Decoding
 from dsvla_jax.policy import Policy
 from dsvla_jax.report import (
@@ -160,7 +161,7 @@ def save_strips(file: Path, task: str, endings: Sequence[Ending]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for i, ending in enumerate(endings):
         marked = [mark_targets(f, t, ending.camera) for f, t in zip(ending.frames, ending.targets, strict=False)]
-        cv2.imwrite(str(folder / f"{task}-{i}.png"), film_strip([*marked, ending.frames[-1]])[..., ::-1])
+        write_picture(folder / f"{task}-{i}.png", film_strip([*marked, ending.frames[-1]]))
 
 
 def load_strips(file: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str, int], list[np.ndarray]]:

@@ -140,8 +140,13 @@ def check_shard(folder: Path, entry: dict[str, Any], digest: bool = False) -> No
         raise DataError(path, "sha256", entry["sha256"], got, fix)
 
 
-def write_episodes(folder: Path | str, episodes: Iterable[Episode], per_shard: int = 20) -> None:
-    """Writes a whole data set at once: shards of up to `per_shard` episodes of one task, then the index."""
+def write_episodes(
+    folder: Path | str, episodes: Iterable[Episode], per_shard: int = 20, settings: dict[str, Any] | None = None
+) -> None:
+    """Writes a whole data set at once: shards of up to `per_shard` episodes of one task, then the index.
+
+    settings: how the data were made. Other writers must be kept out by the caller (`files.hold_folder`).
+    """
     folder = Path(folder)
     by_task: dict[str, list[Episode]] = {}
     for episode in episodes:
@@ -151,7 +156,7 @@ def write_episodes(folder: Path | str, episodes: Iterable[Episode], per_shard: i
         for start in range(0, len(group), per_shard):
             name = shard_name(task, start // per_shard)
             shards.append(write_shard(folder, name, task, group[start : start + per_shard]))
-    write_index(folder, shards)
+    write_index(folder, shards, settings)
 
 
 def _marks(shard: dict[str, Any], first: int, count: int) -> list[Any]:

@@ -22,7 +22,7 @@ def complete_in_processes(
     keep: Callable[..., None],
     start: Callable[[], None] | None = None,
 ) -> None:
-    """Calls work(*job, report) for each job in one of `workers` processes; keep(*what it reports) is called in this one.
+    """Calls work(*job, report) for each job in one of `workers` processes; keep(*report) is called in this one.
 
     work, start: functions of a module; `start` is called in each process first. An error of a job is raised here and
     ends the others, as do Ctrl-C and, however this process ends, its end.

@@ -3,10 +3,13 @@
 import contextlib
 import ctypes
 import errno
+import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
@@ -31,6 +34,12 @@ def fail_with_message() -> Iterator[None]:
         where = "" if error.filename is None else f"{error.filename}: "
         fix = "choose another path, or mend this one (its name, permissions, free space)"
         print(f"error: {where}{error.strerror}; {fix}", file=sys.stderr)
+        sys.exit(1)
+    except Exception as error:
+        # array_record, tensorstore and other native libraries have their own errors for a full or read-only disk.
+        if not any(os.strerror(number) in str(error) for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)):
+            raise
+        print(f"error: {str(error).splitlines()[0]}; free space, or choose another path", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print("stopped; nothing that was finished is lost", file=sys.stderr)
@@ -67,9 +76,20 @@ def ended_by_sigterm(kept: str) -> Iterator[None]:
         signal.signal(signal.SIGTERM, previous)
 
 
-def cache_folder() -> Path:
-    """Where things are kept that can be made again."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dsvla_jax"
+def cache_folder() -> Path | None:
+    """Where things are kept that can be made again; None if the user has no home, or nothing can be written there.
+
+    By the XDG standard a variable that is empty or names a relative path counts as not set.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        folder = (base if base.is_absolute() else Path.home() / ".cache") / "dsvla_jax"
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(1 << 16))
+    except (OSError, RuntimeError):
+        return None
+    return folder
 
 
 def configure_jax(physics: str = "mujoco") -> None:
@@ -82,7 +102,13 @@ def configure_jax(physics: str = "mujoco") -> None:
         # never end. It reads this when it starts; MJX's arrays are too small to gain from threads.
         os.environ.setdefault("NPROC", "1")
     if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "xla"))
+        folder = cache_folder()
+        if folder is not None:
+            jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
+        elif multiprocessing.parent_process() is None:
+            print("compiled programs are not kept for the next time: no cache folder can be written", file=sys.stderr)
+    # A cache whose disk fills up later costs time only, and JAX would say so for every program.
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

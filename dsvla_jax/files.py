@@ -1,4 +1,4 @@
-"""Files that another program or a full disk could spoil: one writer a folder, whole files, errors that name the file."""
+"""Files that another program or a full disk could spoil: one writer a folder, whole files, errors that name them."""
 
 import contextlib
 import errno
@@ -78,12 +78,13 @@ def write_bytes(path: Path, data: bytes) -> None:
             raise
 
 
-def write_picture(path: Path, rgb: np.ndarray) -> None:
-    """Writes uint8 (H, W, 3), red first, in the format that the name's ending says.
+def write_picture(path: Path, rgb: np.ndarray, compression: int = 1) -> None:
+    """Writes uint8 (H, W, 3), red first, in the format that the name's ending says. compression: of PNG, 0 to 9.
 
     Raises UserError naming the file: OpenCV's own `imwrite` only returns False.
     """
-    written, data = cv2.imencode(path.suffix, np.ascontiguousarray(rgb[..., ::-1]))
+    parameters = [cv2.IMWRITE_PNG_COMPRESSION, compression]
+    written, data = cv2.imencode(path.suffix, np.ascontiguousarray(rgb[..., ::-1]), parameters)
     if not written:
         raise ValueError(f"{path}: expected a picture uint8 (H, W, 3), got {rgb.dtype} {rgb.shape}")
     write_bytes(path, data.tobytes())

@@ -216,8 +216,8 @@ def test_a_position_is_refused_in_other_demonstrations(folder, tmp_path_factory)
     write_episodes(other, [*episodes[:6], random_episode(8, frames=3)], per_shard=3)
     with pytest.raises(
         DataError,
-        match=r"grown.*: demonstrations: expected lamp_on 7 episodes \(16 frames\) as at the saved position, got lamp_on 8"
-        r" episodes \(18 frames\); .* start a new run with these",
+        match=r"grown.*: expected lamp_on 7 episodes \(16 frames\) as at the saved position, got lamp_on 8 episodes"
+        r" \(18 frames\); .* start a new run with these",
     ):
         make_loader(EpisodeReader(grown), batch_size=4, seed=1).set_state(state)
     with pytest.raises(DataError, match=r"other.*: expected those of the saved position, got as many others"):

@@ -1,8 +1,10 @@
 """What two programs at once, a full disk or a signal must not spoil: folders of demonstrations and other files."""
 
+import contextlib
 import io
 import os
 import pickle
+import resource
 import signal
 import subprocess
 import sys
@@ -11,14 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
 
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader, write_index
 from data_pipelines.processes import complete_in_processes
+from data_pipelines.records import decode_rgb
 from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
 from data_pipelines.writer import DemonstrationWriter
+from dsvla_jax.command_line import cache_folder, fail_with_message
+from dsvla_jax.compile_times import first_use
 from dsvla_jax.errors import DataError, UserError
-from dsvla_jax.files import hold_folder
+from dsvla_jax.files import hold_folder, write_picture
 from tests.rlbench_files import write_dataset
 from tests.test_data import FakeExpert, contents
 from tests.test_recording import GOOD, make_recording
@@ -43,7 +49,7 @@ def test_a_killed_writer_leaves_the_folder_free(tmp_path):
     program = f"""
 import sys
 from pathlib import Path
-from dsvla_jax.files import hold_folder
+from dsvla_jax.files import hold_folder, write_picture
 held = hold_folder(Path({str(tmp_path)!r}), "writes there")
 print("held", flush=True)
 sys.stdin.read()
@@ -75,9 +81,9 @@ def test_a_writer_does_not_take_the_place_of_a_file_that_no_index_names(tmp_path
 
 def test_an_import_is_refused_while_another_one_runs(tmp_path):
     source = write_dataset(tmp_path / "source", ["lamp_on"], episodes=1, frames=12, size=16)
-    with hold_folder(tmp_path / "out", "writes demonstrations there"):
-        with pytest.raises(UserError, match=r"out: another process writes demonstrations there"):
-            import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
+    other = hold_folder(tmp_path / "out", "writes demonstrations there")
+    with other, pytest.raises(UserError, match=r"out: another process writes demonstrations there"):
+        import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
     assert import_demonstrations(source, tmp_path / "out", Settings(), progress=False) == []
 
 
@@ -165,7 +171,6 @@ if __name__ == "__main__":
     ("number", "status", "said"),
     [
         (signal.SIGTERM, 75, "SIGTERM: what was finished is kept\n"),
-        (signal.SIGINT, 130, "stopped; nothing that was finished is lost\n"),
         (signal.SIGKILL, -signal.SIGKILL, ""),
     ],
 )
@@ -191,3 +196,120 @@ def test_workers_end_with_the_program_that_started_them(tmp_path, number, status
 def test_a_worker_that_was_killed_ends_in_a_message():
     with pytest.raises(UserError, match="a worker process was ended from outside, most often for want of memory"):
         complete_in_processes(killed, [("one",)], 1, print)
+
+
+@contextlib.contextmanager
+def full_disk(room):
+    """Files of this process cannot grow beyond `room` bytes: writing fails as on a full disk, also in C++."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+FULL = r"not written: .*File too large; free space or correct the permissions there, then run the same command again"
+
+
+def test_demonstrations_on_a_full_disk_end_in_one_message_and_continue(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    generate_demonstrations(whole, ["lamp_on"], 8, demonstrator=FakeExpert(), batch=4, progress=False)
+    generate_demonstrations(parts, ["lamp_on"], 2, demonstrator=FakeExpert(), batch=4, progress=False)
+    before = contents(parts)
+    with full_disk(1000), pytest.raises(UserError, match=rf"{parts}/lamp_on-00001.array_record: {FULL}"):
+        generate_demonstrations(parts, ["lamp_on"], 8, demonstrator=FakeExpert(), batch=4, progress=False)
+    assert contents(parts) == before
+    generate_demonstrations(parts, ["lamp_on"], 8, demonstrator=FakeExpert(), batch=4, progress=False)
+    assert contents(parts) == contents(whole)
+
+
+def test_an_import_to_a_full_disk_ends_in_one_message(tmp_path):
+    source = write_dataset(tmp_path / "source", ["lamp_on"], episodes=1, frames=12, size=16)
+    with full_disk(1000), pytest.raises(UserError, match=rf"lamp_on-00000.array_record: {FULL}"):
+        import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
+    import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
+    assert len(EpisodeReader(tmp_path / "out")) == 1
+
+
+@pytest.mark.parametrize("room", [1000, 70000])
+def test_recordings_that_a_full_disk_refuses_are_written_later(tmp_path, room):
+    """The smaller room ends in the shard, the larger one in the index, which is made long by its instructions."""
+    writer = DemonstrationWriter(tmp_path)
+    writer.add(GOOD, keyframes=[5, 11])
+    writer.add(make_recording(task="put_down", instruction="put the cup down " * 5000), keyframes=[5, 11])
+    with full_disk(room), pytest.raises(UserError, match="File too large"):
+        writer.close()
+    writer.close()
+    assert EpisodeReader(tmp_path, verify="sha256").tasks == ("pick_up", "put_down")
+    shards = sorted(path.name for path in tmp_path.glob("*.array_record*"))
+    assert shards == ["pick_up-00000.array_record", "put_down-00000.array_record"]
+
+
+def test_pictures_that_cannot_be_written_are_not_passed_over(tmp_path):
+    picture = np.zeros((8, 8, 3), np.uint8)
+    picture[..., 0] = 200
+    write_picture(tmp_path / "strip.png", picture)
+    np.testing.assert_array_equal(decode_rgb((tmp_path / "strip.png").read_bytes()), picture)
+    with pytest.raises(UserError, match=r"missing/strip.png: not written: No such file"):
+        write_picture(tmp_path / "missing" / "strip.png", picture)
+    with full_disk(10), pytest.raises(UserError, match=rf"other.png: {FULL}"):
+        write_picture(tmp_path / "other.png", picture)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["strip.png"]
+
+
+def test_native_errors_of_a_full_disk_end_in_one_message(capsys):
+    def write():
+        writer = array_record_module.ArrayRecordWriter("/dev/full", "group_size:1,uncompressed")
+        writer.write(b"record")
+        writer.close()
+
+    with pytest.raises(SystemExit) as end, fail_with_message():
+        write()
+    assert end.value.code == 1
+    assert capsys.readouterr().err.startswith("error: write() failed: No space left on device; writing /dev/full")
+
+
+@pytest.mark.parametrize("kind", ["file", "missing home", "full"])
+def test_without_a_cache_the_work_is_done_all_the_same(tmp_path, monkeypatch, kind):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" if kind == "file" else tmp_path))
+    if kind == "missing home":
+        monkeypatch.setenv("XDG_CACHE_HOME", "")
+        monkeypatch.setenv("HOME", "/dev/null/nobody")
+    said = []
+    with full_disk(100) if kind == "full" else contextlib.nullcontext():
+        assert cache_folder() is None
+        with first_use("act", said.append):
+            pass
+    assert said == ["compiling"]
+
+
+def test_times_of_compiling_are_noted_where_the_standard_says(tmp_path, monkeypatch):
+    """An empty variable is one that is not set; what another program left in the file is not read as times."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for value in ("", "relative"):
+        monkeypatch.setenv("XDG_CACHE_HOME", value)
+        assert cache_folder() == tmp_path / "home" / ".cache" / "dsvla_jax"
+    notes = tmp_path / "home" / ".cache" / "dsvla_jax" / "first_use_seconds.json"
+    for content in ("[1]", "{", '{"act (cpu)": "long"}'):
+        notes.write_text(content)
+        said = []
+        with first_use("act", said.append):
+            pass
+        with first_use("act", said.append):
+            pass
+        assert said == ["compiling", "compiling or loading, 0 s last time"]
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
+
+
+def test_programs_say_once_that_nothing_is_kept(tmp_path):
+    program = (
+        "from dsvla_jax.command_line import configure_jax; configure_jax(); import jax; print(jax.numpy.ones(3) + 1)"
+    )
+    environment = {**os.environ, "XDG_CACHE_HOME": "/dev/null", "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "[2. 2. 2.]\n")
+    assert done.stderr == "compiled programs are not kept for the next time: no cache folder can be written\n"
