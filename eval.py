@@ -22,6 +22,7 @@ import dsvla_jax.policy
 from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.command_line import configure_jax, fail_with_message, require_each_option_once
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import write_picture
 from dsvla_jax.model.decode import Decoding
 from dsvla_jax.policy import Policy
 from dsvla_jax.report import (
@@ -225,9 +226,7 @@ def save_strips(file: Path, task: str, endings: Sequence[Ending]) -> None:
     file.with_suffix("").mkdir(parents=True, exist_ok=True)
     for i, ending in enumerate(endings):
         marked = [mark_targets(f, t, ending.camera) for f, t in zip(ending.frames, ending.targets, strict=False)]
-        _, encoded = cv2.imencode(".png", film_strip([*marked, ending.frames[-1]])[..., ::-1])
-        # cv2.imwrite would not say that a disk is full.
-        strip_file(file, task, i).write_bytes(encoded.tobytes())
+        write_picture(strip_file(file, task, i), film_strip([*marked, ending.frames[-1]]))
 
 
 def load_strips(file: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str, int], list[np.ndarray]]:

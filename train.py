@@ -8,7 +8,6 @@ command is given again; a finished one is left as it is.
 
 import contextlib
 import dataclasses
-import fcntl
 import itertools
 import signal
 import sys
@@ -35,6 +34,7 @@ from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import hold_folder
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA, initialize
@@ -314,12 +314,7 @@ def require_same_experiment(run: Path, experiment: Experiment) -> None:
 @contextlib.contextmanager
 def only_one_process(run: Path) -> Iterator[None]:
     """Holds the run folder against another train.py; the system lets go of it however this one ends."""
-    with (run / ".lock").open("w") as file:
-        try:
-            if jax.process_index() == 0:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UserError(f"{run}: another process is training this run; wait for it, or stop it first") from error
+    with hold_folder(run, "is training this run") if jax.process_index() == 0 else contextlib.nullcontext():
         yield
 
 

@@ -9,13 +9,13 @@ import dataclasses
 import sys
 from pathlib import Path
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.files import write_picture
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
@@ -49,7 +49,7 @@ def run_expert(environment: Environment, keys: jax.Array, film: Path | None = No
         film.mkdir(parents=True, exist_ok=True)
         pictures = np.stack([np.asarray(environment.observe(s).rgb)[:4] for s in states], axis=1)
         rows = [np.concatenate(list(row), axis=1) for row in pictures]
-        cv2.imwrite(str(film / f"{environment.task.name}.png"), np.concatenate(rows)[..., ::-1])
+        write_picture(film / f"{environment.task.name}.png", np.concatenate(rows))
     return {name: np.asarray(environment.success(end)) for name, end in ends.items()}
 
 

@@ -15,13 +15,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax
 import mujoco
 import numpy as np
 import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.files import write_picture
 from dsvla_jax.perception.keypoints import Sighting, draw_sightings, locate
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.objects import object_geoms, object_masks
@@ -108,7 +108,7 @@ def measure(name: str, options: Options) -> tuple[list[float], int, list[float]]
         if options.out:
             options.out.mkdir(parents=True, exist_ok=True)
             picture = draw_sightings(np.asarray(seen.rgb)[i], sightings)
-            cv2.imwrite(str(options.out / f"{name}-{i}.png"), picture[..., ::-1])
+            write_picture(options.out / f"{name}-{i}.png", picture)
     return errors, solids, to_own
 
 

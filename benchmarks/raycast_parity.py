@@ -16,8 +16,8 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
-import cv2
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -25,6 +25,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from dsvla_jax.files import write_picture
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.sim import raycast
 from dsvla_jax.types import Camera
@@ -232,7 +233,7 @@ def main() -> int:
             pictures.append(gl_rgb)
         if args.pictures:
             os.makedirs(args.pictures, exist_ok=True)
-            cv2.imwrite(os.path.join(args.pictures, f"{name.replace(' ', '_')}.png"), np.hstack(pictures)[..., ::-1])
+            write_picture(Path(args.pictures) / f"{name.replace(' ', '_')}.png", np.hstack(pictures))
     Console(width=max(120, Console().width)).print(table)
     return 1 if failed else 0
 

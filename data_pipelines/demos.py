@@ -8,13 +8,9 @@ the result is the same.
 
 import contextlib
 import dataclasses
-import multiprocessing
 import os
-import queue
-import signal
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,10 +21,12 @@ import tyro
 from tqdm import tqdm
 
 from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
+from data_pipelines.processes import complete_in_processes
 from data_pipelines.records import Episode, make_episode, mark_missing
-from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.command_line import configure_jax, ended_by_sigterm, fail_with_message
 from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import hold_folder
 from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
@@ -179,15 +177,41 @@ def generate_demonstrations(
 ) -> None:
     """Makes sure that the folder holds at least `episodes` successful demonstrations of every task.
 
-    For one caller a folder. What is there already with the same settings (fields of `Settings`) is kept; other
-    settings raise DataError.
+    What is there already with the same settings (fields of `Settings`) is kept; other settings raise DataError. Several
+    callers may ask for the same folder: one makes what is missing, the others wait for it, and say so. SIGTERM ends the
+    program with status 75; the same call continues.
     demonstrator: (task name, settings) -> the function that attempts episodes; made only when something is missing.
     workers: processes at work on a task each; 1 works in this one.
     """
     wanted = Settings(**settings)
     folder = Path(folder)
-    entries = {entry["file"]: entry for entry in existing_shards(folder, dataclasses.asdict(wanted))}
-    missing = [task for task in tasks if not is_complete(folder, task, episodes, entries)]
+
+    def shards() -> dict[str, dict[str, Any]]:
+        return {entry["file"]: entry for entry in existing_shards(folder, dataclasses.asdict(wanted))}
+
+    entries = shards()
+    with contextlib.ExitStack() as stack:
+        # A folder that holds everything may be read-only.
+        if not all(is_complete(folder, task, episodes, entries, digest=False) for task in tasks):
+            stack.enter_context(ended_by_sigterm("what was finished is kept, and the same command continues"))
+            stack.enter_context(hold_folder(folder, "makes demonstrations there", wait=True))
+            entries = shards()
+        missing = [task for task in tasks if not is_complete(folder, task, episodes, entries)]
+        _make_missing(folder, tasks, missing, episodes, wanted, entries, demonstrator, workers, progress)
+
+
+def _make_missing(
+    folder: Path,
+    tasks: Sequence[str],
+    missing: Sequence[str],
+    episodes: int,
+    wanted: Settings,
+    entries: dict[str, dict[str, Any]],
+    demonstrator: Callable[[str, Settings], Demonstrate],
+    workers: int,
+    progress: bool,
+) -> None:
+    """Writes the missing shards of the `missing` ones of the tasks, and the index after each."""
     made, attempts = 0, 0
     with tqdm(total=episodes * len(tasks), desc="demonstrations", unit="episode", disable=not progress) as bar:
         bar.update(episodes * (len(tasks) - len(missing)))
@@ -204,7 +228,7 @@ def generate_demonstrations(
         jobs = [(folder, task, episodes, wanted, entries, demonstrator) for task in missing]
         bar.set_postfix_str("the first batch of each task compiles" if jobs else "")
         if workers > 1 and len(jobs) > 1:
-            _complete_in_processes(jobs, min(workers, len(jobs)), keep)
+            complete_in_processes(complete_task, jobs, min(workers, len(jobs)), keep, configure_jax)
         else:
             for job in jobs:
                 complete_task(*job, keep)
@@ -245,57 +269,26 @@ def complete_task(
             )
 
 
-def _complete_in_processes(
-    jobs: Sequence[tuple[Any, ...]], workers: int, keep: Callable[[dict[str, Any], int, int], None]
-) -> None:
-    """Does the jobs (arguments of `complete_task` but for the last) in other processes; keep is called in this one."""
-    # Not forked: JAX has threads of its own.
-    context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager, ProcessPoolExecutor(workers, context, _start_worker) as pool:
-        finished = manager.Queue()
-        waiting = [pool.submit(_complete_and_tell, job, finished) for job in jobs]
-        try:
-            while waiting or not finished.empty():
-                with contextlib.suppress(queue.Empty):
-                    keep(*finished.get(timeout=0.2))
-                for future in [future for future in waiting if future.done()]:
-                    waiting.remove(future)
-                    future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-
-
-def _start_worker() -> None:
-    # An interrupt is for the first process, which ends the others.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    configure_jax()
-
-
-def _complete_and_tell(job: tuple[Any, ...], finished: Any) -> None:
-    complete_task(*job, keep=lambda *shard: finished.put(shard))
-
-
-def is_complete(folder: Path, task: str, episodes: int, entries: Mapping[str, dict[str, Any]]) -> bool:
-    """Whether so many episodes of the task are there."""
+def is_complete(
+    folder: Path, task: str, episodes: int, entries: Mapping[str, dict[str, Any]], digest: bool = True
+) -> bool:
+    """Whether so many episodes of the task are there; with `digest` their files are read and compared too."""
     kept, number = 0, 0
     while kept < episodes:
         entry = entries.get(shard_name(task, number))
-        if entry is None or not is_usable(folder, entry, episodes - kept):
+        if entry is None or not is_usable(folder, entry, episodes - kept, digest):
             return False
         kept += len(entry["frames"])
         number += 1
     return True
 
 
-def is_usable(folder: Path, entry: dict[str, Any], needed: int) -> bool:
+def is_usable(folder: Path, entry: dict[str, Any], needed: int, digest: bool = True) -> bool:
     """Whether a shard of the index is there and, if it was cut short when fewer episodes were asked for, long enough.
     Raises DataError for one that is there but damaged: nobody's file is overwritten unasked."""
     if (entry["cut"] and len(entry["frames"]) < needed) or not (folder / entry["file"]).exists():
         return False
-    check_shard(folder, entry, digest=True)
+    check_shard(folder, entry, digest)
     return True
 
 

@@ -4,6 +4,8 @@ A shard is an array_record file (random access by number) of ``records.pack_epis
 its task, frame counts, size and sha256, because array_record itself reads a truncated file as an empty one.
 """
 
+import contextlib
+import hashlib
 import json
 import os
 from collections.abc import Iterable, Sequence
@@ -22,7 +24,8 @@ from data_pipelines.records import (
     unpack_episode,
 )
 from dsvla_jax.digests import file_digest
-from dsvla_jax.errors import DataError
+from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.files import write_bytes, writing
 
 FORMAT_NAME = "dsvla-episodes"
 FORMAT_VERSION = 1
@@ -50,17 +53,26 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
     sizes = sorted({picture_size(png) for episode in episodes for png in (*episode.rgb_png, *episode.depth_png)})
     if len(sizes) > 1:
         raise DataError(folder / name, "picture size", "one (height, width) for all", str(sizes), _ONE_SIZE)
-    temporary = folder / f"{name}.partial"
-    # The pictures are compressed already; one record a chunk makes random access cheap.
-    writer = array_record_module.ArrayRecordWriter(str(temporary), "group_size:1,uncompressed")
-    for episode in episodes:
-        writer.write(pack_episode(episode))
-    writer.close()
+    temporary, digests = folder / f"{name}.partial", []
+    try:
+        with writing(folder / name):
+            # The pictures are compressed already; one record a chunk makes random access cheap.
+            writer = array_record_module.ArrayRecordWriter(str(temporary), "group_size:1,uncompressed")
+            for episode in episodes:
+                record = pack_episode(episode)
+                digests.append(hashlib.blake2b(record, digest_size=8).hexdigest())
+                writer.write(record)
+            writer.close()
+    except UserError:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     entry = {
         "file": name,
         "task": task,
         "num_arms": episodes[0].num_arms if episodes else 0,
         "frames": [episode.num_frames for episode in episodes],
+        "digests": digests,
         "picture_size": list(sizes[0]) if sizes else None,
         "instructions": sorted({episode.instruction for episode in episodes}),
         "bytes": temporary.stat().st_size,
@@ -81,9 +93,7 @@ def write_index(folder: Path, shards: Sequence[dict[str, Any]], settings: dict[s
         "settings": settings or {},
         "shards": list(shards),
     }
-    temporary = folder / f"{INDEX_FILE}.partial"
-    temporary.write_text(json.dumps(index, indent=1, sort_keys=True) + "\n")
-    os.replace(temporary, folder / INDEX_FILE)
+    write_bytes(folder / INDEX_FILE, (json.dumps(index, indent=1, sort_keys=True) + "\n").encode())
 
 
 def read_index(folder: Path) -> dict[str, Any]:
@@ -130,8 +140,13 @@ def check_shard(folder: Path, entry: dict[str, Any], digest: bool = False) -> No
         raise DataError(path, "sha256", entry["sha256"], got, fix)
 
 
-def write_episodes(folder: Path | str, episodes: Iterable[Episode], per_shard: int = 20) -> None:
-    """Writes a whole data set at once: shards of up to `per_shard` episodes of one task, then the index."""
+def write_episodes(
+    folder: Path | str, episodes: Iterable[Episode], per_shard: int = 20, settings: dict[str, Any] | None = None
+) -> None:
+    """Writes a whole data set at once: shards of up to `per_shard` episodes of one task, then the index.
+
+    settings: how the data were made. Other writers must be kept out by the caller (`files.hold_folder`).
+    """
     folder = Path(folder)
     by_task: dict[str, list[Episode]] = {}
     for episode in episodes:
@@ -141,7 +156,16 @@ def write_episodes(folder: Path | str, episodes: Iterable[Episode], per_shard: i
         for start in range(0, len(group), per_shard):
             name = shard_name(task, start // per_shard)
             shards.append(write_shard(folder, name, task, group[start : start + per_shard]))
-    write_index(folder, shards)
+    write_index(folder, shards, settings)
+
+
+def _marks(shard: dict[str, Any], first: int, count: int) -> list[Any]:
+    """What tells episodes first .. first + count - 1 of a shard from others, as far as its index entry knows."""
+    if "digests" in shard:
+        return shard["digests"][first : first + count]
+    # Of earlier versions. A shard that was cut short may be written again, longer.
+    whole = count == len(shard["frames"]) and not shard.get("cut")
+    return [shard["sha256"]] if whole else shard["frames"][first : first + count]
 
 
 class EpisodeReader:
@@ -204,9 +228,23 @@ class EpisodeReader:
         chosen, left = [], count if episodes is None else episodes
         for shard in mine:
             first = min(skip, len(shard["frames"]))
-            chosen.append({**shard, "frames": shard["frames"][first : first + left], "first": first})
+            frames = shard["frames"][first : first + left]
+            chosen.append({**shard, "frames": frames, "first": first, "marks": _marks(shard, first, len(frames))})
             skip, left = skip - first, left - len(chosen[-1]["frames"])
         return [shard for shard in chosen if shard["frames"]]
+
+    def contents(self) -> dict[str, Any]:
+        """What the reader gives, as JSON: counts by task in their order, and a digest that tells equal counts apart.
+
+        It stays the same while the folder grows by episodes that this reader does not give.
+        """
+        tasks: dict[str, dict[str, int]] = {}
+        for entry in self._shards:
+            counts = tasks.setdefault(entry["task"], {"episodes": 0, "frames": 0})
+            counts["episodes"] += len(entry["frames"])
+            counts["frames"] += sum(entry["frames"])
+        marks = [[entry["task"], *entry["marks"]] for entry in self._shards]
+        return {"tasks": tasks, "digest": hashlib.blake2b(json.dumps(marks).encode(), digest_size=8).hexdigest()}
 
     def __getstate__(self) -> dict[str, Any]:
         # Open files do not travel to worker processes; each opens its own.

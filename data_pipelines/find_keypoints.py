@@ -9,16 +9,16 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_pipelines.episodes import EpisodeReader, write_episodes
+from data_pipelines.episodes import INDEX_FILE, EpisodeReader, write_episodes
 from data_pipelines.records import Episode, decode_depth, decode_rgb
 from dsvla_jax.command_line import fail_with_message
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import hold_folder, write_picture
 from dsvla_jax.perception.grounding import GroundingOptions
 from dsvla_jax.perception.keypoints import KeypointsNotFound, Segmenter, Sighting, draw_sightings, find_keypoints
 from dsvla_jax.perception.phrases import ObjectPhrases, phrases_for
@@ -66,13 +66,17 @@ def _active(poses: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
 
 
 def main(options: Options) -> None:
-    if options.out.exists():
-        raise UserError(f"{options.out}: exists already; choose another folder")
     reader, table = EpisodeReader(options.demos), (*options.grounding.table(), *suite_phrases())
-    segment = options.grounding.segmenter()
+    settings = {
+        "importer": "find_keypoints",
+        "detector": options.grounding.detector,
+        "mask_model": options.grounding.mask_model,
+        "box_threshold": options.grounding.box_threshold,
+        "from": reader.settings,
+    }
     problems: list[str] = []
 
-    def found() -> Iterator[Episode]:
+    def found(segment: Segmenter) -> Iterator[Episode]:
         for number in tqdm(range(len(reader)), unit="episode"):
             original = reader.episode(number)
             name = f"{original.task}-{original.seed}"
@@ -85,9 +89,12 @@ def main(options: Options) -> None:
             if options.draw:
                 options.draw.mkdir(parents=True, exist_ok=True)
                 picture = draw_sightings(decode_rgb(original.rgb_png[0]), sightings)
-                cv2.imwrite(str(options.draw / f"{name}.png"), picture[..., ::-1])
+                write_picture(options.draw / f"{name}.png", picture)
 
-    write_episodes(options.out, found())
+    with hold_folder(options.out, "writes demonstrations there"):
+        if (options.out / INDEX_FILE).exists():
+            raise UserError(f"{options.out}: holds demonstrations already; choose another folder")
+        write_episodes(options.out, found(options.grounding.segmenter()), settings=settings)
     print("\n".join([*problems, f"{len(reader) - len(problems)} of {len(reader)} episodes written to {options.out}"]))
 
 

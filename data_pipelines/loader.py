@@ -1,7 +1,9 @@
 """From recorded episodes to batches: shuffled, endless, split over processes, and resumable to the exact sample."""
 
+import json
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, SupportsIndex
 
 import grain
@@ -9,6 +11,7 @@ import numpy as np
 
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.records import Frame
+from dsvla_jax.errors import DataError
 
 Sample = dict[str, Any]
 ToSample = Callable[[Frame, np.random.Generator], Sample]
@@ -27,8 +30,40 @@ class FrameSource(grain.sources.RandomAccessDataSource[Frame]):
         return self._reader.frame(operator.index(record_key))
 
     def __repr__(self) -> str:
-        # grain stores this text with an iterator's state to recognise the source on restore.
         return f"FrameSource(tasks={self._reader.tasks}, frames={len(self)})"
+
+
+class EpisodeLoader(Iterator[Sample]):
+    """Batches with a position that can be saved, together with what it is a position in; made by `make_loader`."""
+
+    def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: dict[str, Any]):
+        self._batches, self._folder, self._contents = batches, folder, contents
+
+    def __next__(self) -> Sample:
+        return next(self._batches)
+
+    def get_state(self) -> dict[str, Any]:
+        """JSON: the position, which counts batches, and the demonstrations that it is in (`EpisodeReader.contents`)."""
+        return {"position": self._batches.get_state(), "data": self._contents}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continues from a position. Raises DataError if it was saved with other demonstrations than these.
+
+        A state without them, as checkpoints of earlier versions hold, is taken at its word.
+        """
+        if "data" in state and (then := state["data"]) != (now := json.loads(json.dumps(self._contents))):
+            fix = "restore those demonstrations, or start a new run with these (another --run)"
+            if then["tasks"] == now["tasks"]:
+                raise DataError(self._folder, "demonstrations", "those of the saved position", "as many others", fix)
+            expected, got = _summary(then, now), _summary(now, then)
+            raise DataError(self._folder, "demonstrations", f"{expected} as at the saved position", got, fix)
+        self._batches.set_state(state.get("position", state))
+
+
+def _summary(contents: dict[str, Any], other: dict[str, Any]) -> str:
+    """The tasks of one that the other has not in the same number."""
+    tasks = {task: counts for task, counts in contents["tasks"].items() if other["tasks"].get(task) != counts}
+    return ", ".join(f"{task} {n['episodes']} episodes ({n['frames']} frames)" for task, n in tasks.items()) or "none"
 
 
 def frame_arrays(frame: Frame, rng: np.random.Generator) -> Sample:
@@ -48,7 +83,7 @@ def make_loader(
     process_index: int = 0,
     process_count: int = 1,
     num_threads: int = 2,
-) -> grain.DatasetIterator[Sample]:
+) -> EpisodeLoader:
     """Batches of samples; one epoch is every frame of every episode once, in an order that is new each epoch.
 
     to_sample: (frame, generator) -> arrays of shapes that are the same for all samples. The generator depends only on
@@ -57,8 +92,8 @@ def make_loader(
     process_index, process_count: a batch of all processes together is cut into `process_count` equal parts, of
     `batch_size` samples each, and this process gets its part: the whole is the same however many share it.
 
-    The iterator has ``get_state()`` and ``set_state(state)``: a JSON-able position, which counts batches. It is the
-    same in every process, and good for another number of processes that share batches of the same size.
+    The position (`EpisodeLoader.get_state`) is the same in every process, and good for another number of processes that
+    share batches of the same size.
     """
     if to_sample is None and len(set(reader.num_arms.values())) > 1:
         raise ValueError(
@@ -79,4 +114,4 @@ def make_loader(
     if process_count > 1:
         batches = batches[process_index : len(batches) // process_count * process_count : process_count]
     options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=4 if num_threads else 0)
-    return iter(batches.to_iter_dataset(options))
+    return EpisodeLoader(iter(batches.to_iter_dataset(options)), reader.folder, reader.contents())

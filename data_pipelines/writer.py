@@ -1,5 +1,6 @@
 """Write a folder of one's own demonstrations, for train.py and `python -m data_pipelines.inspect`."""
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -10,9 +11,10 @@ import numpy as np
 from data_pipelines.episodes import INDEX_FILE, read_index, shard_name, write_index, write_shard
 from data_pipelines.keyframes import discover_keyframes, sample_starts
 from data_pipelines.recording import Recording, check_recording, make_demonstration
-from data_pipelines.records import Episode, decode_frame
+from data_pipelines.records import Episode, decode_frame, picture_size
 from dsvla_jax.encoding.codec import PoseCodec
-from dsvla_jax.errors import DataError
+from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.files import hold_folder
 from dsvla_jax.observation_checks import check_surface
 
 EPISODES_PER_SHARD = 20
@@ -24,8 +26,10 @@ class DemonstrationWriter:
         with DemonstrationWriter("data/mine") as writer:
             writer.add(recording, joint_velocities=velocities)
 
-    A recording that is refused leaves the others as they are. What was added is on disk after every
-    `EPISODES_PER_SHARD` recordings of a task, and at the end of the block, also where that ends in an error.
+    One writer holds a folder at a time: another one, or an import, is refused until this one is closed or its process
+    ends. A recording that is refused leaves the others as they are. What was added is on disk after every
+    `EPISODES_PER_SHARD` recordings of a task, and at the end of the block, also if that ends in an error. Recordings
+    that the disk has no room for stay in memory: free space, then call `close`.
 
     every_n: further samples start at every so many observations between key poses; 0 for none.
     codec: the policy's; a pose outside of its box could not be written as text, and is refused.
@@ -36,15 +40,31 @@ class DemonstrationWriter:
         self._settings = {"importer": "recordings"}
         self._entries: list[dict[str, Any]] = []
         self._waiting: dict[str, list[Episode]] = {}
-        if (self.folder / INDEX_FILE).exists():
-            index = read_index(self.folder)
-            if index["settings"] != self._settings:
-                fix = "choose a folder of its own"
-                raise DataError(self.folder, "folder", "recordings", "demonstrations of another origin", fix)
-            self._entries = index["shards"]
+        self._lock = hold_folder(self.folder, "adds demonstrations there")
+        try:
+            self._entries = self._read_entries()
+        except BaseException:
+            self._lock.close()
+            raise
+        self._report_strays()
+        self._sizes = {entry["task"]: tuple(entry["picture_size"]) for entry in self._entries}
         self._counts = {entry["task"]: 0 for entry in self._entries}
         for entry in self._entries:
             self._counts[entry["task"]] += len(entry["frames"])
+
+    def _read_entries(self) -> list[dict[str, Any]]:
+        if not (self.folder / INDEX_FILE).exists():
+            return []
+        index = read_index(self.folder)
+        if index["settings"] != self._settings:
+            fix = "choose a folder of its own"
+            raise DataError(self.folder, "folder", "recordings", "demonstrations of another origin", fix)
+        return index["shards"]
+
+    def _report_strays(self) -> None:
+        named = {entry["file"] for entry in self._entries}
+        if strays := sorted({path.name for path in self.folder.glob("[!.]*.array_record")} - named):
+            print(f"{self.folder}: not in its index, and left as it is: {', '.join(strays)}", file=sys.stderr)
 
     def add(
         self,
@@ -62,6 +82,8 @@ class DemonstrationWriter:
         Raises:
             DataError: the recording cannot be right, or neither or both of the above are given.
         """
+        if self._lock.closed:
+            raise UserError(f"{self.folder}: this writer is closed; add recordings before, or open another one")
         number = self._counts.get(recording.task, 0)
         where = f"recording {number} of {recording.task!r}"
         check_recording(recording, where)
@@ -78,9 +100,10 @@ class DemonstrationWriter:
         self._check_box(episode, where)
         first = decode_frame(episode, 0)
         check_surface(first["depth"], first["intrinsics"], first["world_from_camera"], episode.keypoints, where)
+        self._check_size(episode, where)
         self._counts[recording.task] = number + 1
         self._waiting.setdefault(recording.task, []).append(episode)
-        if len(self._waiting[recording.task]) == EPISODES_PER_SHARD:
+        if len(self._waiting[recording.task]) >= EPISODES_PER_SHARD:
             self._write(recording.task)
         return episode
 
@@ -106,16 +129,34 @@ class DemonstrationWriter:
             fix = "move the world's origin (poses, cameras and keypoints alike), or give the config's own codec"
             raise DataError(where, "pose", f"positions from {low.tolist()} to {high.tolist()}", f"{got}", fix)
 
+    def _check_size(self, episode: Episode, where: str) -> None:
+        sizes = sorted({picture_size(png) for png in episode.rgb_png})
+        expected = self._sizes.get(episode.task, sizes[0])
+        if sizes != [expected]:
+            fix = "resize the pictures (intrinsics too), or give the recording a task of its own"
+            raise DataError(where, "picture size", f"{expected} for all of {episode.task!r}", str(sizes), fix)
+        self._sizes[episode.task] = expected
+
     def _write(self, task: str) -> None:
-        episodes = self._waiting.pop(task)
         number = sum(entry["task"] == task for entry in self._entries)
-        self._entries.append(write_shard(self.folder, shard_name(task, number), task, episodes))
-        write_index(self.folder, sorted(self._entries, key=lambda entry: entry["file"]), self._settings)
+        # A shard that no index names, of a writer that was killed before it wrote one, holds somebody's recordings.
+        while (self.folder / shard_name(task, number)).exists():
+            number += 1
+        entry = write_shard(self.folder, shard_name(task, number), task, self._waiting[task])
+        entries = sorted([*self._entries, entry], key=lambda entry: entry["file"])
+        try:
+            write_index(self.folder, entries, self._settings)
+        except UserError:
+            (self.folder / entry["file"]).unlink()
+            raise
+        self._entries = entries
+        del self._waiting[task]
 
     def close(self) -> None:
-        """Writes what is not yet on disk."""
+        """Writes what is not yet on disk, and lets go of the folder."""
         for task in list(self._waiting):
             self._write(task)
+        self._lock.close()
 
     def __enter__(self) -> "DemonstrationWriter":
         return self

@@ -9,13 +9,13 @@ import re
 import sys
 from pathlib import Path
 
-import cv2
 import jax.numpy as jnp
 import numpy as np
 import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import write_picture
 from dsvla_jax.report import film_strip
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
@@ -66,7 +66,7 @@ def draw(name: str) -> Path:
     frames = [np.asarray(environment.observe(state).rgb[best]) for state in (states[0], states[-1])]
     path = DOCS / "images" / "tasks" / f"{name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), film_strip(frames)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    write_picture(path, film_strip(frames), compression=9)
     return path
 
 

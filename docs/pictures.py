@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from dsvla_jax.command_line import configure_jax
 from dsvla_jax.data_config import DataConfig
+from dsvla_jax.files import write_picture
 from dsvla_jax.report import film_strip, mark_targets
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
@@ -31,7 +31,7 @@ def main() -> None:
     strips = [demonstration(name) for name in DataConfig().tasks]
     path = Path(__file__).parent / "images" / "episodes.png"
     path.parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(path), np.concatenate(strips)[..., ::-1])
+    write_picture(path, np.concatenate(strips))
     print(path)
 
 

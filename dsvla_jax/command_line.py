@@ -3,11 +3,17 @@
 import contextlib
 import ctypes
 import errno
+import multiprocessing
 import os
+import signal
 import socket
 import sys
+import tempfile
+import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import FrameType
 
 import jax
 
@@ -36,6 +42,12 @@ def fail_with_message() -> Iterator[None]:
         fix = "choose another path, or mend this one (its name, permissions, free space)"
         print(f"error: {where}{error.strerror}; {fix}", file=sys.stderr)
         sys.exit(1)
+    except Exception as error:
+        # array_record, tensorstore and other native libraries have their own errors for a full or read-only disk.
+        if not any(os.strerror(number) in str(error) for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)):
+            raise
+        print(f"error: {str(error).splitlines()[0]}; free space, or choose another path", file=sys.stderr)
+        sys.exit(1)
     except KeyboardInterrupt:
         print("stopped; nothing that was finished is lost", file=sys.stderr)
         sys.exit(130)
@@ -49,9 +61,50 @@ def require_each_option_once(arguments: Sequence[str]) -> None:
             raise UserError(f"{name} is given {names.count(name)} times; give it once, with all its values after it")
 
 
-def cache_folder() -> Path:
-    """Where things are kept that can be made again."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dsvla_jax"
+class _Ended(SystemExit):
+    """SIGTERM came."""
+
+
+@contextlib.contextmanager
+def ended_by_sigterm(kept: str) -> Iterator[None]:
+    """Within the block SIGTERM raises SystemExit, so that what the block began is ended too; a second one kills.
+
+    The status is 75, as of a run that saved and stopped: schedulers may requeue. kept: said to people. Does nothing
+    outside of the main thread, or in a job of several processes, whose SIGTERM JAX's preemption service notes.
+    """
+    if threading.current_thread() is not threading.main_thread() or jax.distributed.is_initialized():
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        raise _Ended(os.EX_TEMPFAIL)
+
+    previous = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    except _Ended:
+        print(f"SIGTERM: {kept}", file=sys.stderr)
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def cache_folder() -> Path | None:
+    """Where things are kept that can be made again; None if the user has no home, or nothing can be written there.
+
+    By the XDG standard a variable that is empty or names a relative path counts as not set.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        folder = (base if base.is_absolute() else Path.home() / ".cache") / "dsvla_jax"
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(1 << 16))
+    except (OSError, RuntimeError):
+        return None
+    return folder
 
 
 def configure_jax(physics: str = "mujoco") -> None:
@@ -64,7 +117,13 @@ def configure_jax(physics: str = "mujoco") -> None:
         # never end. It reads this when it starts; MJX's arrays are too small to gain from threads.
         os.environ.setdefault("NPROC", "1")
     if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "xla"))
+        folder = cache_folder()
+        if folder is not None:
+            jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
+        elif multiprocessing.parent_process() is None:
+            print("compiled programs are not kept for the next time: no cache folder can be written", file=sys.stderr)
+    # A cache whose disk fills up later costs time only, and JAX would say so for every program.
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

@@ -200,6 +200,59 @@ def test_resumed_iterator_continues_exactly(folder):
         jax.tree.map(np.testing.assert_array_equal, next(resumed), batch)
 
 
+def position_after(folder, batches=3, **choice):
+    iterator = make_loader(EpisodeReader(folder, **choice), batch_size=4, seed=1)
+    for _ in range(batches):
+        next(iterator)
+    return json.loads(json.dumps(iterator.get_state()))
+
+
+def test_a_position_is_refused_in_other_demonstrations(folder, tmp_path_factory):
+    """A folder that grew, or was written again, would go on with other samples without a word."""
+    state = position_after(folder)
+    episodes = [random_episode(seed, frames=1 + seed % 4) for seed in range(7)]
+    grown, other = tmp_path_factory.mktemp("grown"), tmp_path_factory.mktemp("other")
+    write_episodes(grown, [*episodes, random_episode(7, frames=2)], per_shard=3)
+    write_episodes(other, [*episodes[:6], random_episode(8, frames=3)], per_shard=3)
+    with pytest.raises(
+        DataError,
+        match=r"grown.*: expected lamp_on 7 episodes \(16 frames\) as at the saved position, got lamp_on 8 episodes"
+        r" \(18 frames\); .* start a new run with these",
+    ):
+        make_loader(EpisodeReader(grown), batch_size=4, seed=1).set_state(state)
+    with pytest.raises(DataError, match=r"other.*: expected those of the saved position, got as many others"):
+        make_loader(EpisodeReader(other), batch_size=4, seed=1).set_state(state)
+
+
+def test_a_position_outlives_growth_by_episodes_that_are_not_used(tmp_path):
+    """One folder may serve runs that want more and fewer demonstrations of a task."""
+    generate_demonstrations(tmp_path, ["lamp_on"], 5, demonstrator=FakeExpert(), batch=4, progress=False)
+    state = position_after(tmp_path, episodes=5)
+    expected = identities([next(resumed(tmp_path, state, episodes=5))])
+    generate_demonstrations(tmp_path, ["lamp_on"], 9, demonstrator=FakeExpert(), batch=4, progress=False)
+    assert identities([next(resumed(tmp_path, state, episodes=5))]) == expected
+
+
+def resumed(folder, state, **choice):
+    iterator = make_loader(EpisodeReader(folder, **choice), batch_size=4, seed=1)
+    iterator.set_state(state)
+    return iterator
+
+
+def test_positions_of_earlier_versions_are_still_taken(folder):
+    iterator = make_loader(EpisodeReader(folder), batch_size=4, seed=1)
+    for _ in range(4):
+        batch = next(iterator)
+    # What was saved before the demonstrations were noted beside the number, and before an index held digests.
+    index = json.loads((folder / "index.json").read_text())
+    for entry in index["shards"]:
+        del entry["digests"]
+    (folder / "index.json").write_text(json.dumps(index))
+    assert identities([next(resumed(folder, {"next_index": 3}))]) == identities([batch])
+    state = position_after(folder)
+    assert identities([next(resumed(folder, state))]) == identities([batch])
+
+
 def test_processes_share_the_samples_out(folder):
     reader = EpisodeReader(folder)
 

@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import sys
 import uuid
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
     """The index of a split, from its file where that is current."""
     key = _fingerprint(build, dataset, config)
     path = _cache_path(build, dataset, config, key)
-    if path.is_file():
+    if path is not None and path.is_file():
         # One that was cut short in copying is made again.
         with contextlib.suppress(ValueError):
             return _unpack(json.loads(path.read_text()))
@@ -101,12 +102,24 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
         if index.unlabelled:
             fix = f"{index.unlabelled} have no instruction: set unlabelled to keep to learn from them without words"
         raise DataError(build.folder, f"split {config.split}", "at least one usable episode", "none", fix)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Not the process's number: it is the same in two containers that share a disk.
-    temporary = path.with_suffix(f".{uuid.uuid4().hex}.partial")
-    temporary.write_text(json.dumps(_pack(index)) + "\n")
-    os.replace(temporary, path)
+    _keep(index, path)
     return index
+
+
+def _keep(index: Index, path: Path | None) -> None:
+    """Saves the index for the next time, if that is possible: the work goes on without."""
+    problem = "no cache folder can be written"
+    try:
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Not the process's number: it is the same in two containers that share a disk.
+            temporary = path.with_suffix(f".{uuid.uuid4().hex}.partial")
+            temporary.write_text(json.dumps(_pack(index)) + "\n")
+            os.replace(temporary, path)
+            return
+    except OSError as error:
+        problem = f"{path}: {error.strerror}"
+    print(f"the index is not kept for the next time ({problem}); name another folder with --oxe.cache", file=sys.stderr)
 
 
 def scan(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True) -> Index:
@@ -248,13 +261,14 @@ def _stamp(path: str) -> tuple[int, float | None] | None:
     return (files.size_of(path), files.written(path)) if files.exists(path) else None
 
 
-def _cache_path(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, key: str) -> Path:
+def _cache_path(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, key: str) -> Path | None:
     name = f"dsvla_index_{dataset.name}_{config.split}_{key[:16]}.json"
     if config.cache:
         return Path(config.cache) / name
     if not files.is_remote(build.folder) and os.access(build.folder, os.W_OK):
         return Path(build.folder) / name
-    return cache_folder() / "oxe" / name
+    folder = cache_folder()
+    return None if folder is None else folder / "oxe" / name
 
 
 def _pack(index: Index) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from data_pipelines.rlbench.files import find_episodes, read_recording
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.digests import file_digest
 from dsvla_jax.errors import DataError
+from dsvla_jax.files import hold_folder
 
 EPISODES_PER_SHARD = 20
 
@@ -116,6 +117,14 @@ def import_demonstrations(
     if missing := set(tasks) - set(found):
         raise DataError(source, "tasks", f"some of {', '.join(found)}", ", ".join(sorted(missing)), "choose others")
     chosen = {task: folders[:episodes] for task, folders in found.items() if not tasks or task in tasks}
+    with hold_folder(out, "writes demonstrations there"):
+        return _import_missing(chosen, out, settings, episodes, skip_bad, progress)
+
+
+def _import_missing(
+    chosen: dict[str, list[Path]], out: Path, settings: Settings, episodes: int | None, skip_bad: bool, progress: bool
+) -> list[dict[str, str]]:
+    """Writes the shards that `out` lacks of the episode folders of each task; returns what was left out."""
     wanted = {"importer": "rlbench", **dataclasses.asdict(settings)}
     entries = {entry["file"]: entry for entry in existing_shards(out, wanted)}
     imported = {name: digest for entry in entries.values() for name, digest in entry.get("origin", {}).items()}
