@@ -24,6 +24,7 @@ from dsvla_jax.report import EpisodeResult, read_results, write_results
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, save_experiment
 from tests.small import small_encoding, small_language, small_vision
+from train import advice
 
 TOKENIZER = suite_tokenizer()
 EXPERIMENT = Experiment(
@@ -148,6 +149,8 @@ def test_a_run_of_open_x_embodiment_does_not_act_in_the_simulator(tmp_path: Path
     run = write_run(tmp_path / "run", experiment)
     with pytest.raises(UserError, match=r"poses in each robot's own frame.*finetune it on simulated tasks first"):
         main(run)
+    assert advice(experiment).startswith("finetune it in simulation with: python train.py CONFIG --base")
+    assert advice(EXPERIMENT).startswith("evaluate it with")
     assert not (run / "eval").exists()
 
 

@@ -31,7 +31,8 @@ def _build(spec) -> None:
 
     rubbish = task.add_object(spec, "rubbish", RUBBISH, damping=1e-4)
     white = [0.95, 0.95, 0.95, 1]
-    task.add_part(rubbish, "rubbish", task.BOX, [RUBBISH] * 3, [0, 0, 0], white, OBJECT_AND_FIXTURE, mass=0.05)
+    # Of 0.05 kg, it shoots out of closing fingers in 1 of 125 episodes of C MuJoCo; of 0.2 kg, in none of 1,000.
+    task.add_part(rubbish, "rubbish", task.BOX, [RUBBISH] * 3, [0, 0, 0], white, OBJECT_AND_FIXTURE, mass=0.2)
     for i, (quat, shade) in enumerate((([0.9, 0.3, 0.3, 0.1], 0.9), ([0.9, -0.2, 0.1, 0.4], 0.85))):
         creased = [shade, shade, shade, 1]
         task.add_part(rubbish, f"rubbish_crease{i}", task.BOX, [0.0175] * 3, [0, 0, 0.001], creased, quat=quat)
