@@ -156,7 +156,7 @@ def test_a_hand_that_only_trembles_comes_to_no_rest():
     ],
 )
 def test_a_gripper_on_its_way_counts_as_the_end_that_it_reaches(readings, command):
-    values = np.float32(readings).astype(np.float64)
+    values = np.array(readings, np.float32).astype(np.float64)
     told = settled(lambda _: values[:, None])(None)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(told, command, atol=1e-7)
 
