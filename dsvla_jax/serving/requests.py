@@ -1,5 +1,6 @@
 """What a robot asks: a message checked field by field, before it can get anywhere near the other robots' requests."""
 
+import contextlib
 import dataclasses
 from typing import Any
 
@@ -119,8 +120,11 @@ def check_first_keypoints(request: Request, keypoints: np.ndarray) -> None:
         return  # neither depth nor camera was sent
     # Filled up with the last, which changes nothing, so that every number of keypoints runs what is compiled already.
     padded = np.pad(keypoints, ((0, 0), (0, max(MAX_KEYPOINTS - keypoints.shape[1], 0)), (0, 0)), "edge")
+    where = (np.asarray(camera.intrinsics), np.asarray(camera.world_from_camera), size, "request")
+    with contextlib.suppress(DataError):
+        return check_keypoints(padded, *where)
     try:
-        check_keypoints(padded, np.asarray(camera.intrinsics), np.asarray(camera.world_from_camera), size, "request")
+        check_keypoints(keypoints, *where)  # for its message, which lists them
     except DataError as error:
         raise BadRequest(str(error)) from error
 
