@@ -51,6 +51,7 @@ class Rule:
     """Status 1 is right if this is printed, because what was trained at toy size has learned nothing."""
 
 
+TASKS = "lamp_on bimanual_lift_ball"
 TRAIN = "--steps 2 --batch-size 4 --data.episodes 4"
 OWN = {
     "RUN": "runs/tiny",
@@ -69,7 +70,7 @@ write_dataset(Path("toy/rlbench"), ["lamp_on"], size=96, descriptions=["turn on 
 ORIGINAL = {f"SRC{suffix}": f"tests/golden/original/{file}" for suffix, file in (("", "llama"), ("2", "clip.pt"))}
 
 RULES = (
-    Rule("^make train", f'TRAIN_OPTIONS="{TRAIN}" EVAL_OPTIONS="--episodes 2"'),
+    Rule("^make train", f'TRAIN_OPTIONS="{TRAIN}" EVAL_OPTIONS="--episodes 1"'),
     Rule("^make test", 'PYTEST_ADDOPTS="-k linked_files"'),
     Rule("^make bench"),
     Rule("^make (parity|lock)", only_parsed="installs PyTorch and TensorFlow, or resolves the lock again"),
@@ -84,18 +85,22 @@ RULES = (
     Rule("train.py .*--validate-every", f"{TRAIN} --validate-every 2 --validation.episodes 1 --validation.batches 1"),
     Rule("train.py .*--evaluate-every", f"{TRAIN} --evaluate-every 2 --evaluation.episodes-while-training 1"),
     Rule("train.py .*--help"),
+    Rule("train.py .*--data.tasks all", f"{TRAIN} --data.tasks {TASKS}"),
     Rule("train.py", TRAIN),
     Rule("eval.py .*--compare"),
     Rule("eval.py .*--physics mjx", "--episodes 1 --tasks lamp_on"),
-    Rule("eval.py runs/all", "--episodes 1"),
-    Rule("eval.py .*--step best", "--episodes 1", {"RUN": "runs/validated"}),
-    Rule("eval.py", "--episodes 2", OWN),
-    Rule("data_pipelines.demos", "--episodes 2"),
+    Rule("eval.py runs/all", f"--episodes 1 --tasks {TASKS}"),
+    Rule("eval.py .*--step best", "--episodes 1 --tasks lamp_on", {"RUN": "runs/validated"}),
+    Rule("eval.py", "--episodes 1 --tasks lamp_on", OWN),
+    Rule("data_pipelines.demos", f"--episodes 4 --tasks {TASKS}"),
+    Rule("oxe fixtures", "--episodes 4"),
     Rule("data_pipelines.find_keypoints|--perception", only_parsed="needs PyTorch and weights from a hub"),
     Rule("data_pipelines", words=OWN),
     Rule("weights import SRC", words={"OUT": "bases/mine", "FILE": "tests/golden/original/adapter.pth", **ORIGINAL}),
     Rule("weights import", words=OWN),
     Rule("weights export", words={"RUN": "runs/tiny_lora", "runs/paper_7b": "runs/tiny_lora", "OUT": "exports/run"}),
+    Rule("training.plan .*--search", "--topology v5e:2x2"),
+    Rule("training.plan .*--examples", "--examples 8 16"),
     Rule("training.plan"),
     Rule("dsvla_jax.serving", words=OWN, serves=True),
     Rule("robot_client", "--key-poses 2", fails="no success"),
