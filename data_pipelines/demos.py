@@ -269,6 +269,8 @@ def _complete_in_processes(
 
 
 def _start_worker() -> None:
+    # C MuJoCo runs on the CPU anyway, and the first process may hold all memory of an accelerator.
+    jax.config.update("jax_platforms", "cpu")
     # An interrupt is for the first process, which ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     configure_jax()
