@@ -35,20 +35,21 @@ class Timing:
         }
 
 
+def call(what: Callable[[], T]) -> tuple[T, float]:
+    """The result, and the seconds until it is there."""
+    began = time.perf_counter()
+    result = jax.block_until_ready(what())
+    return result, time.perf_counter() - began
+
+
 def timed(what: Callable[[], T], repeats: int, seconds: float = math.inf) -> tuple[T, Timing]:
     """The last result of calling ``what`` once and then ``repeats`` times, and how long each call took.
 
     seconds: the later calls end early when they have taken so long together; there is at least one.
     """
-
-    def once() -> tuple[T, float]:
-        began = time.perf_counter()
-        result = jax.block_until_ready(what())
-        return result, time.perf_counter() - began
-
-    result, first = once()
+    result, first = call(what)
     later: list[float] = []
     while not later or (len(later) < repeats and sum(later) < seconds):
-        result, took = once()
+        result, took = call(what)
         later.append(took)
     return result, Timing(first, tuple(later))

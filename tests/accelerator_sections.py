@@ -6,10 +6,12 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 from benchmarks._accelerator.report import Report
 from benchmarks._accelerator.sections import SIZES, Job, Section
 from benchmarks._accelerator.worker import SECTION_FAILED, run_sections
+from dsvla_jax.errors import UserError
 
 
 def good(job: Job) -> None:
@@ -33,6 +35,11 @@ def endless(job: Job) -> None:
 
 def last(job: Job) -> None:
     job.note(answer=43)
+
+
+def platforms_expert(task: str, settings: Any) -> Any:
+    """In the place of a scripted expert: says on what JAX runs in the process that demonstrates."""
+    raise UserError(f"platforms: {sys.modules['jax'].config.jax_platforms}")
 
 
 def sections(*names: str, seconds: float = 0.0) -> list[Section]:

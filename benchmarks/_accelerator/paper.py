@@ -25,7 +25,7 @@ from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, VisionConfig, VisualPromptConfig
-from dsvla_jax.model.partition import make_sharded
+from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import join_variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.policy import Policy, PolicyConfig
@@ -34,7 +34,7 @@ from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.flops import model_flops, prefill_flops
 from dsvla_jax.training.planning import held_bytes, peak_bytes
 from dsvla_jax.training.sharding import make_mesh, put_batch
-from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step, start_state
 from dsvla_jax.types import Camera, Observation
 from tests.vocabularies import INSTRUCTIONS, small_tokenizer
 
@@ -98,19 +98,50 @@ def train_batch(experiment: Experiment, tokenizer: Tokenizer, size: int) -> dict
     return {name: np.stack([one[name] for one in samples]) for name in samples[0]}
 
 
+def random_variables(shapes: Any, mesh: jax.sharding.Mesh) -> Any:
+    """Random variables of these shapes, made on the device one after the other, the largest first.
+
+    As one program they would all be there in float32 at once: the process's peak memory would be that of this
+    beginning, and say nothing about what comes after.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(shapes)
+    places = jax.tree.leaves(shardings(shapes, mesh))
+    # The quickest of the generators on an accelerator.
+    keys = jax.random.split(jax.random.key(0, impl="rbg"), len(leaves))
+    made: list[Any] = [None] * len(leaves)
+    for number in sorted(range(len(leaves)), key=lambda number: -leaves[number][1].size):
+        path, leaf = leaves[number]
+        make = partial(random_leaf, name=path[-1].key, shape=leaf.shape, dtype=leaf.dtype)
+        made[number] = jax.jit(make, out_shardings=places[number])(keys[number])
+    return structure.unflatten(made)
+
+
+def random_leaf(key: jax.Array, name: str, shape: tuple[int, ...], dtype: Any) -> jax.Array:
+    """One variable, at the scale that it begins with."""
+    if name in ("scale", "bias", "gate", "b"):
+        return jnp.full(shape, float(name == "scale"), dtype)
+    scale = jnp.asarray(shape[-2] ** -0.5 if len(shape) > 1 else 1.0, dtype)
+    if len(shape) == 3:
+        # A layer at a time, because a generator's bits take several times the memory of what is made from them.
+        draw = partial(jax.random.normal, shape=shape[1:], dtype=dtype)
+        return jax.lax.map(lambda one: draw(one) * scale, jax.random.split(key, shape[0]))
+    return jax.random.normal(key, shape, dtype) * scale
+
+
 def make_weights(job: Job) -> dict[str, Any]:
-    """State and frozen weights, made on the device at random, once for the sections of this module."""
+    """State and frozen weights, once for the sections of this module."""
     if "frozen" not in job.shared:
         experiment = paper_experiment(job.sizes.name)
-        optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+        mesh, optimizer = one_device(experiment), make_optimizer(experiment.optimizer, experiment.steps)
         start = time.perf_counter()
-        made = make_sharded(partial(initial_state, experiment, None, optimizer), one_device(experiment))
-        job.shared["state"], job.shared["frozen"] = jax.block_until_ready(made)
-        parameters = jax.tree.leaves((job.shared["state"].trainable, job.shared["frozen"]))
-        job.note(
-            parameters=sum(leaf.size for leaf in parameters),
-            weights={"seconds": time.perf_counter() - start, "in_use_gib": gib("bytes_in_use"), "peak_gib": gib(_PEAK)},
-        )
+        state, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+        trainable, job.shared["frozen"] = random_variables((state.trainable, frozen), mesh)
+        parameters = sum(leaf.size for leaf in jax.tree.leaves((trainable, frozen)))
+        begin = partial(start_state, optimizer=optimizer, seed=experiment.seed)
+        job.shared["state"] = jax.jit(begin, donate_argnums=0, out_shardings=shardings(state, mesh))(trainable)
+        jax.block_until_ready(job.shared)
+        figures = {"seconds": time.perf_counter() - start, "in_use_gib": gib("bytes_in_use"), "peak_gib": gib(_PEAK)}
+        job.note(parameters=parameters, weights=figures)
     return job.shared
 
 

@@ -25,6 +25,8 @@ class Sizes:
     actions: int = 20
     episodes: tuple[int, ...] = (32, 256, 1024)
     """Side by side in the device loop."""
+    keyframes: int = 8
+    """At most so many in an episode of the device loop; fewer for tasks whose experts need less than half."""
     rollouts: int = 3
     pixels: tuple[int, ...] = (64, 128, 336)
     frames: int = 128
@@ -55,6 +57,7 @@ SIZES = {
         robots=(1, 2),
         actions=2,
         episodes=(2,),
+        keyframes=2,
         rollouts=1,
         pixels=(16, 32),
         frames=2,

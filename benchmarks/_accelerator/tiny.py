@@ -76,7 +76,7 @@ def tiny(job: Job) -> None:
     rates = success_rates(read_results(run / "eval" / "mujoco.jsonl"))
     job.note(
         success=macro_mean(rates),
-        **{f"success_{rate.task}": rate.rate for rate in rates},
+        **{f"success_{rate.name}": rate.rate for rate in rates},
         episodes=experiment.evaluation.episodes,
         evaluation_seconds=time.perf_counter() - start,
     )
