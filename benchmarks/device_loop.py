@@ -9,28 +9,27 @@ beside them.
 
 import dataclasses
 import sys
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
 import dsvla_jax.policy
+from benchmarks._timing import timed
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.device_rollout import DeviceRollout, Rollout
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.policy import Policy
 from dsvla_jax.rollout import Ending, run_episodes
-from dsvla_jax.rollout_keypoints import keypoint_source
+from dsvla_jax.rollout_keypoints import Keypoints, keypoint_source
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.training.experiment import load_experiment
+from dsvla_jax.types import Array
 
-T = TypeVar("T")
 REPEATS = 3
 
 
@@ -55,16 +54,10 @@ def agreeing(policy: Policy, endings: list[Ending], rollout: Rollout) -> int:
     )
 
 
-def timed(what: Callable[[], T]) -> tuple[T, float, float]:
-    """The result, seconds of the first call, and of the quickest further one."""
-
-    def once() -> tuple[float, T]:
-        began = time.perf_counter()
-        result = jax.block_until_ready(what())
-        return time.perf_counter() - began, result
-
-    first, result = once()
-    return result, first, min(once()[0] for _ in range(REPEATS))
+def first_keypoints(environment: Environment, state: SimState, kind: Keypoints) -> Array | None:
+    """The keypoints (B, A, K, 3) that the whole episodes have; None for the task's own."""
+    find = keypoint_source(kind, environment)
+    return jnp.asarray(find(state)(state, environment.observe(state))[0]) if find else None
 
 
 def main(options: Options) -> int:
@@ -75,18 +68,18 @@ def main(options: Options) -> int:
         on_device = DeviceRollout(environment, policy)
         for batch in options.batches:
             state = environment.reset(episode_keys(0, "eval", task, 0, batch))
+            keypoints = first_keypoints(environment, state, experiment.keypoints)
             find = keypoint_source(experiment.keypoints, environment)
-            source = find(state) if find else None
-            keypoints = source(state, environment.observe(state))[0] if source else None
-            from_host = partial(run_episodes, environment, policy.act, state, find_keypoints=source)
-            endings, host_first, host = timed(from_host)
-            rollout, device_first, device = timed(partial(on_device, state, keypoints))
+            from_host = partial(run_episodes, environment, policy.act, state, find_keypoints=find and find(state))
+            endings, host_times = timed(from_host, REPEATS)
+            rollout, device_times = timed(partial(on_device, state, keypoints), REPEATS)
+            device, host = min(device_times.later), min(host_times.later)
             same = agreeing(policy, endings, rollout)
             different += batch - same
             print(
                 f"{task} x {batch}: {same} of {batch} episodes agree, {sum(e.success for e in endings)} succeed; "
                 f"{batch / device:.2f} episodes/s on the device, {batch / host:.2f} from the host "
-                f"(the first time: {device_first:.0f} s and {host_first:.0f} s)",
+                f"(the first time: {device_times.first:.0f} s and {host_times.first:.0f} s)",
                 flush=True,
             )
     return int(different > 0)

@@ -16,8 +16,10 @@ import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.types import Action
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,14 +32,18 @@ class Options:
     """A line of JSON is added for each task; tasks that have one already are not run again."""
 
 
+def outcomes(environment: Environment, start: SimState, plan: Action) -> np.ndarray:
+    """bool (B,): which episodes succeed that begin so and follow a plan of poses (B, M, A, 7)."""
+    return np.asarray(environment.success(environment.follow(start, plan)[-1]))
+
+
 def compare(name: str, episodes: int) -> dict[str, float | str]:
     """Both kinds of physics from the state that C MuJoCo settles into, with the plan made from it."""
     reference, environment = Environment(name), Environment(name, physics="mjx")
     start = jax.tree.map(jnp.asarray, reference.reset(episode_keys(0, "validation", name, 0, episodes)))
     plan = reference.expert(start)
     began = time.monotonic()
-    outcomes = [np.asarray(env.success(env.follow(start, plan)[-1])) for env in (reference, environment)]
-    first, second = outcomes
+    first, second = outcomes(reference, start, plan), outcomes(environment, start, plan)
     return {
         "task": name,
         "mujoco": int(first.sum()),

@@ -228,7 +228,7 @@ def _make_missing(
         jobs = [(folder, task, episodes, wanted, entries, demonstrator) for task in missing]
         bar.set_postfix_str("the first batch of each task compiles" if jobs else "")
         if workers > 1 and len(jobs) > 1:
-            complete_in_processes(complete_task, jobs, min(workers, len(jobs)), keep, configure_jax)
+            complete_in_processes(complete_task, jobs, min(workers, len(jobs)), keep, _start_worker)
         else:
             for job in jobs:
                 complete_task(*job, keep)
@@ -267,6 +267,12 @@ def complete_task(
                 f"{task}: expected {episodes} successes of the scripted expert, got {kept} in"
                 f" {number * wanted.batch} attempts; lower `perturb`, or correct the task's expert"
             )
+
+
+def _start_worker() -> None:
+    # C MuJoCo runs on the CPU anyway, and the first process may hold all memory of an accelerator.
+    jax.config.update("jax_platforms", "cpu")
+    configure_jax()
 
 
 def is_complete(

@@ -143,7 +143,9 @@ def track(targets: Array, seed: Array, base: Array) -> Array:
         joints = jnp.clip(joints + change, _JOINT_LOW, _JOINT_HIGH)
         return joints, joints
 
-    return jax.lax.scan(step, jnp.asarray(seed, jnp.float32), targets)[1]
+    # Accelerators would otherwise multiply float32 matrices in fewer bits than the tolerances bear.
+    with jax.default_matmul_precision("highest"):
+        return jax.lax.scan(step, jnp.asarray(seed, jnp.float32), targets)[1]
 
 
 def reaches(joints: Array, pose: Array, base: Array) -> Array:

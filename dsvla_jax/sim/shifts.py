@@ -61,13 +61,15 @@ def check_shifts(names: Sequence[str]) -> tuple[str, ...]:
 def shift(names: Sequence[str], scene: Scene, key: Array, start: Start) -> Start:
     """Applies the named shifts."""
     functions = {"instance": other_instance, "position": other_position, "background": other_background}
-    for number, name in enumerate(SHIFTS):
-        if name in names:
-            stream = jax.random.fold_in(key, number)
-            if name == "camera":
-                start = start.replace(camera=other_view(stream, start.camera))
-            else:
-                start = functions[name](scene, stream, start)
+    # Accelerators would otherwise multiply float32 matrices in fewer bits than a camera's pose bears.
+    with jax.default_matmul_precision("highest"):
+        for number, name in enumerate(SHIFTS):
+            if name in names:
+                stream = jax.random.fold_in(key, number)
+                if name == "camera":
+                    start = start.replace(camera=other_view(stream, start.camera))
+                else:
+                    start = functions[name](scene, stream, start)
     return start
 
 

@@ -37,7 +37,9 @@ def answer_loss(
     likelihood = jnp.take_along_axis(log_probabilities, labels[..., None], axis=-1)[..., 0]
     if targets.weights is not None:
         offered = log_probabilities[..., targets.tokens]
-        expected = jnp.einsum("btu,btu->bt", offered, jnp.asarray(targets.weights)[rows])
+        weights = jnp.asarray(targets.weights)[rows]
+        # An accelerator would round float32 factors, and the loss with them, to fewer bits.
+        expected = jnp.einsum("btu,btu->bt", offered, weights, precision=jax.lax.Precision.HIGHEST)
         likelihood = jnp.where(chooses, expected, likelihood)
     count, bins = answer_counts(answer_mask, number_rows, targets) if counts is None else counts
     loss = -jnp.where(answer, likelihood, 0.0).sum() / count

@@ -120,6 +120,18 @@ def held_bytes(experiment: Experiment, mesh: Mesh) -> int:
     return _bytes((state, frozen))
 
 
+def peak_bytes(compiled: Any) -> int:
+    """Bytes a chip of a compiled program while it runs, by its compiler: arguments, results and temporaries."""
+    memory = compiled.memory_analysis()
+    return (
+        memory.argument_size_in_bytes
+        + memory.output_size_in_bytes
+        - memory.alias_size_in_bytes
+        + memory.temp_size_in_bytes
+        + memory.generated_code_size_in_bytes
+    )
+
+
 def roofline(chip: Chip, flops: float, traffic: float, network: float) -> tuple[float, float]:
     """Seconds if products, memory and network overlap perfectly, and if they do not at all."""
     parts = (flops / chip.flops, traffic / chip.memory_bandwidth, network / chip.network_bandwidth)
@@ -150,15 +162,8 @@ def _plan(
             seconds=(math.inf, math.inf), compile_seconds=seconds,
         )  # fmt: skip
     seconds = time.monotonic() - start
-    memory: Any = compiled.memory_analysis()
+    memory, peak = compiled.memory_analysis(), peak_bytes(compiled)
     cost = program_cost(compiled.as_text())
-    peak = (
-        memory.argument_size_in_bytes
-        + memory.output_size_in_bytes
-        - memory.alias_size_in_bytes
-        + memory.temp_size_in_bytes
-        + memory.generated_code_size_in_bytes
-    )
     return Plan(
         **common,
         temporary=memory.temp_size_in_bytes,
