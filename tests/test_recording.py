@@ -270,7 +270,7 @@ def test_a_camera_on_the_wrist_need_not_see_the_keypoints(tmp_path):
     away[:, 2, 3] += np.linspace(0, 0.2, STEPS)
     with DemonstrationWriter(tmp_path) as writer:
         writer.add(make_recording(world_from_camera=away), keyframes=[5, 11])
-    np.testing.assert_allclose(EpisodeReader(tmp_path).episode(0).keypoints, GOOD.keypoints, atol=1e-6)
+    np.testing.assert_allclose(EpisodeReader(tmp_path).episode(0).keypoints, np.array(GOOD.keypoints), atol=1e-6)
 
 
 @pytest.mark.parametrize("option", [{"every_n": -1}, {"still": -0.1}, {"still": np.nan}, {"stop_buffer": -1}])

@@ -180,7 +180,7 @@ class _Pictures(Sequence[np.ndarray]):
     """
 
     def __init__(self, folder: Path, name: str, count: int, key_poses_only: bool):
-        self.folder, self.count, self.key_poses_only = folder / name, count, key_poses_only
+        self.folder, self.total, self.key_poses_only = folder / name, count, key_poses_only
         files = [path.name for path in sorted(self.folder.glob("[!.]*.png"))]
         if not files:
             kind = name.rsplit("_", 1)[1]
@@ -206,13 +206,13 @@ class _Pictures(Sequence[np.ndarray]):
             raise self._missing(missing[0])
 
     def _missing(self, number: int) -> DataError:
-        expected = f"a picture of each of {self.count} observations"
+        expected = f"a picture of each of {self.total} observations"
         if self.key_poses_only:
             expected = "a picture of the first observation and of each key pose"
         return DataError(self.folder / self.form.format(number), "file", expected, "no such file", _FIX)
 
     def __len__(self) -> int:
-        return self.count
+        return self.total
 
     def __getitem__(self, number: Any) -> np.ndarray:
         if int(number) not in self.names:
