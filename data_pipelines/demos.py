@@ -8,6 +8,7 @@ the result is the same.
 
 import contextlib
 import dataclasses
+import math
 import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +26,7 @@ from data_pipelines.processes import complete_in_processes
 from data_pipelines.records import Episode, make_episode, mark_missing
 from dsvla_jax.command_line import configure_jax, ended_by_sigterm, fail_with_message
 from dsvla_jax.encoding.keypoints import replay_latch
-from dsvla_jax.errors import UserError
+from dsvla_jax.errors import UserError, require
 from dsvla_jax.files import hold_folder
 from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
@@ -61,6 +62,13 @@ class Settings:
     batch: int = 20
     """Episodes simulated at a time, and attempts a shard."""
 
+    def __post_init__(self) -> None:
+        require(self.image_size > 0, "image_size", "at least 1 pixel", self.image_size)
+        require(self.seed >= 0, "seed", "0 or more", self.seed)
+        require(0 <= self.perturb < math.inf, "perturb", "0 or more metres", self.perturb)
+        require(0 <= self.perturb_probability <= 1, "perturb_probability", "0 to 1", self.perturb_probability)
+        require(self.batch > 0, "batch", "at least 1 episode", self.batch)
+
 
 @dataclasses.dataclass(frozen=True)
 class Options(Settings):
@@ -74,6 +82,11 @@ class Options(Settings):
     """Successful demonstrations a task."""
     workers: int = os.cpu_count() or 1
     """Processes, each at work on one task."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.episodes > 0, "episodes", "at least 1 a task", self.episodes)
+        require(self.workers > 0, "workers", "at least 1 process", self.workers)
 
 
 class ScriptedExpert:
@@ -183,6 +196,7 @@ def generate_demonstrations(
     demonstrator: (task name, settings) -> the function that attempts episodes; made only when something is missing.
     workers: processes at work on a task each; 1 works in this one.
     """
+    require(episodes > 0, "episodes", "at least 1 a task", episodes)
     wanted = Settings(**settings)
     folder = Path(folder)
 
@@ -301,6 +315,7 @@ def is_usable(folder: Path, entry: dict[str, Any], needed: int, digest: bool = T
 def main(options: Options) -> None:
     """Generates what the options ask for."""
     tasks = select_tasks(options.tasks)
+    require(bool(tasks), "tasks", "names of tasks, all, single_arm or dual_arm", "none")
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(Settings)}
     generate_demonstrations(options.out, tasks, options.episodes, workers=options.workers, **settings)
 

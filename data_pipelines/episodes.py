@@ -8,7 +8,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from data_pipelines.records import (
     unpack_episode,
 )
 from dsvla_jax.digests import file_digest
+from dsvla_jax.encoding.keypoints import REACHED_RADIUS
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.files import write_bytes, writing
 
@@ -90,6 +91,7 @@ def write_index(folder: Path, shards: Sequence[dict[str, Any]], settings: dict[s
         "version": FORMAT_VERSION,
         "episodes": sum(len(shard["frames"]) for shard in shards),
         "frames": sum(sum(shard["frames"]) for shard in shards),
+        "reached_radius": REACHED_RADIUS,
         "settings": settings or {},
         "shards": list(shards),
     }
@@ -110,19 +112,25 @@ def read_index(folder: Path) -> dict[str, Any]:
         raise DataError(path, "format", FORMAT_NAME, repr(index)[:60], fix)
     if index.get("version") != FORMAT_VERSION:
         raise DataError(path, "version", str(FORMAT_VERSION), repr(index.get("version")), fix + " again")
+    if (found := index.get("reached_radius", REACHED_RADIUS)) != REACHED_RADIUS:
+        fix = "make the data again: the keypoint of each frame was chosen by another distance than a policy's will be"
+        raise DataError(path, "reached_radius", f"{REACHED_RADIUS} m", f"{found}", fix)
     return index
 
 
-def existing_shards(folder: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
+def existing_shards(
+    folder: Path, settings: dict[str, Any], assumed: Mapping[str, Any] | None = None
+) -> list[dict[str, Any]]:
     """The index entries of a folder made with the same settings, for whoever continues it; none where there is none.
 
+    assumed: what folders were made with that are older than a setting.
     Raises DataError where it was made with other settings.
     """
     if not (folder / INDEX_FILE).exists():
         return []
     index = read_index(folder)
     for field, value in settings.items():
-        if (found := index["settings"].get(field)) != value:
+        if (found := index["settings"].get(field, (assumed or {}).get(field))) != value:
             fix = "choose another folder, the same setting, or delete this folder"
             raise DataError(folder / INDEX_FILE, f"settings.{field}", f"{value!r} as asked for", repr(found), fix)
     return index["shards"]

@@ -6,17 +6,39 @@ markusgrotz/peract_bimanual for two arms.
 
 import numpy as np
 
+from dsvla_jax.errors import DataError
+
 # Radians per second: the largest joint velocity of a robot that stands still.
 STILL = 0.1
 # Frames after a stop in which no further stop counts.
 STOP_BUFFER = 4
+# Radians per second: half of the time no joint of a table-top arm moves faster, so larger numbers are degrees.
+MAX_MIDDLE_SPEED = 4.0
 
 
-def discover_keyframes(gripper_open: np.ndarray, joint_velocities: np.ndarray, still: float = STILL) -> list[int]:
+def check_velocities(joint_velocities: np.ndarray, where: object) -> None:
+    """Raises DataError if velocities (T, A, J) are not finite, or cannot be radians per second."""
+    if not np.isfinite(joint_velocities).all():
+        raise DataError(where, "joint_velocities", "finite numbers", "non-finite ones", "leave such observations out")
+    middle = float(np.median(np.abs(joint_velocities).max(axis=(1, 2))))
+    if middle > MAX_MIDDLE_SPEED:
+        got = f"{middle:.3g} for the fastest joint, half of the time"
+        fix = "divide degrees per second by 57.3; in those no rest would be found"
+        raise DataError(where, "joint_velocities", "radians per second", got, fix)
+
+
+def ever_rests(joint_velocities: np.ndarray, still: float = STILL) -> bool:
+    """Whether all joints stand still at once at any time of velocities (T, A, J)."""
+    return bool(np.any(np.all(np.abs(joint_velocities) <= still, axis=(1, 2))))
+
+
+def discover_keyframes(
+    gripper_open: np.ndarray, joint_velocities: np.ndarray, still: float = STILL, stop_buffer: int = STOP_BUFFER
+) -> list[int]:
     """Frames at which a gripper has changed, all arms stand still, or the demonstration ends.
 
     A frame counts as a stop when all joints of all arms are still, it is not one of the last two frames, no gripper
-    changes from two frames before it to one frame after, and the last stop was more than `STOP_BUFFER` frames ago.
+    changes from two frames before it to one frame after, and the last stop was more than `stop_buffer` frames ago.
     Frame 0 is never a key pose; of two adjacent ones at the end the first is dropped.
 
     Looking back from frames 0 and 1 wraps to the end of the demonstration, as Python's negative indices do in PerAct.
@@ -40,7 +62,7 @@ def discover_keyframes(gripper_open: np.ndarray, joint_velocities: np.ndarray, s
             and bool(np.all(np.abs(joint_velocities[i]) <= still))
             and all(np.array_equal(gripper_open[i], gripper_open[j]) for j in (i + 1, i - 1, i - 2))
         )
-        buffer = STOP_BUFFER if stopped else buffer - 1
+        buffer = stop_buffer if stopped else buffer - 1
         changed = i > 0 and not np.array_equal(gripper_open[i], gripper_open[i - 1])
         if i > 0 and (changed or stopped or i == count - 1):
             keyframes.append(i)

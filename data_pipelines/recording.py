@@ -14,7 +14,17 @@ import numpy as np
 from data_pipelines.records import Episode, make_episode
 from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.errors import DataError
-from dsvla_jax.observation_checks import check_camera, check_keypoints, check_pictures, check_poses, has_words
+from dsvla_jax.observation_checks import (
+    KEYPOINT_FIX,
+    check_camera,
+    check_keypoints,
+    check_pictures,
+    check_poses,
+    has_words,
+)
+
+# Metres, and as much in a rotation matrix: a camera that moves less in a whole demonstration stands still.
+STANDS_STILL = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +41,7 @@ class Recording:
     channels: the order of colours in `rgb`; what OpenCV reads is "bgr".
     keypoints: (A, K, 3), the points that each arm is to go near, in the order of the instruction; an arm with fewer
         than K repeats its last. None where they are not known.
+    variation: which of the task's variations it is, None where nobody counts them.
     """
 
     task: str
@@ -43,17 +54,24 @@ class Recording:
     gripper_open: np.ndarray
     keypoints: np.ndarray | None = None
     channels: Literal["rgb", "bgr"] = "rgb"
+    variation: int | None = None
 
 
 def make_demonstration(
-    recording: Recording, samples: Sequence[tuple[int, int]], seed: int, where: object = "recording"
+    recording: Recording,
+    samples: Sequence[tuple[int, int]],
+    seed: int,
+    where: object = "recording",
+    keypoint_fix: str = KEYPOINT_FIX,
 ) -> Episode:
     """The episode of a recording.
+
+    A camera that stands still must see a keypoint in its first picture; one that moves, as on a wrist, need not.
 
     Args:
         samples: (observation to look at, observation to go to) each, ascending; see ``keyframes.sample_starts``.
         seed: the demonstration's number, kept in the episode.
-        where: names the recording in errors.
+        where: names the recording in errors. keypoint_fix: what to do if the camera does not see the keypoints.
 
     Raises:
         DataError: anything that the module's head names, or no samples.
@@ -74,7 +92,8 @@ def make_demonstration(
         check_pictures(picture, distances, place)
         check_camera(intrinsics[start], cameras[start], picture.shape[:2], place)
     keypoints, active = _active_keypoints(recording)
-    check_keypoints(keypoints, intrinsics[starts[0]], cameras[starts[0]], rgb[0].shape[:2], where)
+    if np.abs(cameras - cameras[0]).max() < STANDS_STILL:
+        check_keypoints(keypoints, intrinsics[starts[0]], cameras[starts[0]], rgb[0].shape[:2], where, keypoint_fix)
     pose = np.array(recording.pose, np.float64)
     pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
     return make_episode(
@@ -91,6 +110,7 @@ def make_demonstration(
         target_gripper=recording.gripper_open[targets],
         keypoints=keypoints,
         active_keypoint=active[starts],
+        variation=recording.variation,
     )
 
 

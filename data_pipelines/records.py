@@ -37,7 +37,8 @@ class Episode:
     target_pose: float32 (F, A, 7). target_gripper: float32 (F, A). The next key pose.
     keypoints: float32 (A, K, 3), in the order of the instruction. active_keypoint: float32 (F, A, 3). Where no keypoint
         is known, K is 0 and active_keypoint (F, 0, 3): such a demonstration is prompted without the constraint.
-    seed: the number of the episode in its seed stream.
+    seed: the number of the episode in its seed stream. variation: which of the task's variations it is, None where
+        nobody counts them.
     """
 
     task: str
@@ -53,6 +54,7 @@ class Episode:
     target_gripper: np.ndarray
     keypoints: np.ndarray
     active_keypoint: np.ndarray
+    variation: int | None = None
 
     @property
     def num_frames(self) -> int:
@@ -163,6 +165,7 @@ def make_episode(
     target_gripper: ArrayLike,
     keypoints: ArrayLike,
     active_keypoint: ArrayLike,
+    variation: int | None = None,
 ) -> Episode:
     """Encodes the pictures, rgb uint8 F x (H, W, 3) and depth F x (H, W); a camera without the F axis is repeated."""
     frames = len(rgb)
@@ -184,6 +187,7 @@ def make_episode(
         target_gripper=np.asarray(target_gripper, np.float32),
         keypoints=np.asarray(keypoints, np.float32),
         active_keypoint=np.asarray(active_keypoint, np.float32),
+        variation=variation,
     )
     check_episode(episode, f"episode {seed} of {task}")
     return episode
@@ -225,6 +229,8 @@ def pack_episode(episode: Episode) -> bytes:
         return list(value) if isinstance(value, tuple) else value
 
     fields = {field.name: plain(getattr(episode, field.name)) for field in dataclasses.fields(episode)}
+    if episode.variation is None:
+        del fields["variation"]
     return cast(bytes, msgpack.packb({"version": RECORD_VERSION, **fields}, use_bin_type=True))
 
 
@@ -241,6 +247,8 @@ def unpack_episode(record: bytes, where: object = "episode record") -> Episode:
     values: dict[str, Any] = {}
     for field in dataclasses.fields(Episode):
         if field.name not in fields:
+            if field.default is None:
+                continue
             raise DataError(where, field.name, "to be present", "nothing", fix)
         value = fields[field.name]
         if field.type is np.ndarray:

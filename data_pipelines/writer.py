@@ -1,5 +1,6 @@
 """Write a folder of one's own demonstrations, for train.py and `python -m data_pipelines.inspect`."""
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,11 +10,18 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.episodes import INDEX_FILE, read_index, shard_name, write_index, write_shard
-from data_pipelines.keyframes import discover_keyframes, sample_starts
+from data_pipelines.keyframes import (
+    STILL,
+    STOP_BUFFER,
+    check_velocities,
+    discover_keyframes,
+    ever_rests,
+    sample_starts,
+)
 from data_pipelines.recording import Recording, check_recording, make_demonstration
 from data_pipelines.records import Episode, decode_frame, picture_size
 from dsvla_jax.encoding.codec import PoseCodec
-from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.errors import DataError, UserError, require
 from dsvla_jax.files import hold_folder
 from dsvla_jax.observation_checks import check_surface
 
@@ -33,10 +41,24 @@ class DemonstrationWriter:
 
     every_n: further samples start at every so many observations between key poses; 0 for none.
     codec: the policy's; a pose outside of its box could not be written as text, and is refused.
+    still, stop_buffer: radians per second below which all joints rest at a key pose, and observations after such a stop
+    in which no further one counts. These and every_n are kept with each shard in the index.
     """
 
-    def __init__(self, folder: Path | str, every_n: int = 10, codec: PoseCodec | None = None):
+    def __init__(
+        self,
+        folder: Path | str,
+        every_n: int = 10,
+        codec: PoseCodec | None = None,
+        still: float = STILL,
+        stop_buffer: int = STOP_BUFFER,
+    ):
+        require(every_n >= 0, "every_n", "0 or more observations", every_n)
+        require(0 <= still < math.inf, "still", "0 or more radians per second", still)
+        require(stop_buffer >= 0, "stop_buffer", "0 or more observations", stop_buffer)
         self.folder, self.every_n, self.codec = Path(folder), every_n, codec or PoseCodec()
+        self.still, self.stop_buffer = still, stop_buffer
+        self._discovered = self._restless = 0
         self._settings = {"importer": "recordings"}
         self._entries: list[dict[str, Any]] = []
         self._waiting: dict[str, list[Episode]] = {}
@@ -116,9 +138,11 @@ class DemonstrationWriter:
         if len(shape) != 3 or shape[:2] != gripper.shape:
             fix = "give radians per second of each joint of each arm"
             raise DataError(where, "joint_velocities", f"{gripper.shape} and joints", str(shape), fix)
-        if not np.isfinite(joint_velocities).all():
-            raise DataError(where, "joint_velocities", "finite numbers", "non-finite ones", "give keyframes instead")
-        return discover_keyframes(gripper, np.asarray(joint_velocities))
+        velocities = np.asarray(joint_velocities)
+        check_velocities(velocities, where)
+        self._discovered += 1
+        self._restless += not ever_rests(velocities, self.still)
+        return discover_keyframes(gripper, velocities, self.still, self.stop_buffer)
 
     def _check_box(self, episode: Episode, where: str) -> None:
         low, high = np.array(self.codec.low), np.array(self.codec.high)
@@ -142,7 +166,9 @@ class DemonstrationWriter:
         # A shard that no index names, of a writer that was killed before it wrote one, holds somebody's recordings.
         while (self.folder / shard_name(task, number)).exists():
             number += 1
-        entry = write_shard(self.folder, shard_name(task, number), task, self._waiting[task])
+        made_with = {"every_n": self.every_n, "still": self.still, "stop_buffer": self.stop_buffer}
+        name = shard_name(task, number)
+        entry = write_shard(self.folder, name, task, self._waiting[task], made_with=made_with)
         entries = sorted([*self._entries, entry], key=lambda entry: entry["file"])
         try:
             write_index(self.folder, entries, self._settings)
@@ -156,6 +182,12 @@ class DemonstrationWriter:
         """Writes what is not yet on disk, and lets go of the folder."""
         for task in list(self._waiting):
             self._write(task)
+        if self._restless and not self._lock.closed:
+            print(
+                f"{self.folder}: in {self._restless} of {self._discovered} recordings the joints never all rest (below "
+                f"{self.still:g} rad/s): key poses are changes of a gripper and the end",
+                file=sys.stderr,
+            )
         self._lock.close()
 
     def __enter__(self) -> "DemonstrationWriter":

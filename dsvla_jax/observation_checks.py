@@ -25,6 +25,7 @@ MAX_MIDDLE_DEPTH = 20.0
 MIN_WORKSPACE_SHARE = 0.02
 # Metres: the largest reading that 16 bits of 0.1 mm hold, as depth is stored.
 MAX_DEPTH = 6.5535
+KEYPOINT_FIX = "give metres in the world frame, and world_from_camera, not its inverse"
 
 
 def has_words(instruction: str) -> bool:
@@ -141,10 +142,11 @@ def check_keypoints(
     world_from_camera: np.ndarray,
     size: tuple[int, ...],
     where: object,
+    fix: str = KEYPOINT_FIX,
 ) -> None:
     """Raises DataError where keypoints (A, K, 3) are not finite, one is behind the camera, or all are out of view.
 
-    intrinsics (3, 3), world_from_camera (4, 4), size (height, width): of the first picture.
+    intrinsics (3, 3), world_from_camera (4, 4), size (height, width): of the first picture. fix: said to people.
     """
     if not np.isfinite(keypoints).all():
         raise DataError(where, "keypoints", "finite numbers", "non-finite ones", "or None where not known")
@@ -152,7 +154,6 @@ def check_keypoints(
         return
     camera = Camera(jnp.asarray(intrinsics, jnp.float32), jnp.asarray(world_from_camera, jnp.float32))
     pixels, depth = map(np.asarray, project(np.asarray(keypoints, np.float32), camera))
-    fix = "give metres in the world frame, and world_from_camera, not its inverse"
     if depth.min() <= 0:
         arm, place = np.unravel_index(int(np.argmin(depth)), depth.shape)
         got = f"{keypoints[arm, place].tolist()}, {float(depth[arm, place]):.3f} m along the viewing direction"
@@ -167,8 +168,9 @@ def check_surface(
 ) -> None:
     """Raises DataError unless a keypoint (A, K, 3) of objects is near what the camera sees where it projects to.
 
-    Catches a calibration, a unit or a frame that is wrong though each number looks right. Passes where no keypoint is
-    on a pixel with a reading, and where any is within `SURFACE_TOLERANCE`: others may be hidden or in the air.
+    Catches a calibration, a unit or a frame that is wrong though each number looks right. Passes where no keypoint
+    before the camera is on a pixel with a reading, and where any is within `SURFACE_TOLERANCE`: others may be hidden or
+    in the air.
     """
     camera = Camera(jnp.asarray(intrinsics), jnp.asarray(world_from_camera))
     pixels, distance = map(np.asarray, project(np.asarray(keypoints, np.float32).reshape(-1, 3), camera))
@@ -176,7 +178,7 @@ def check_surface(
     for (u, v), expected in zip(np.rint(pixels).astype(int), distance, strict=True):
         # A keypoint is a little inside its object, and seen edges are ragged: the nearest reading around it counts.
         window = depth[max(v - 2, 0) : max(v + 3, 0), max(u - 2, 0) : max(u + 3, 0)]
-        if (window > 0).any():
+        if expected > 0 and (window > 0).any():
             errors.append(np.abs(window[window > 0] - expected).min())
     if errors and min(errors) > SURFACE_TOLERANCE:
         got = f"{min(errors):.2f} m between the nearest of them and what is seen in its direction"

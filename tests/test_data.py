@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from data_pipelines import augment
-from data_pipelines.demos import ScriptedExpert, Settings, generate_demonstrations
+from data_pipelines.demos import Options, ScriptedExpert, Settings, generate_demonstrations, main
 from data_pipelines.episodes import EpisodeReader, write_episodes
 from data_pipelines.loader import make_loader
 from data_pipelines.records import (
@@ -26,7 +26,7 @@ from data_pipelines.records import (
     unpack_episode,
 )
 from dsvla_jax.encoding.keypoints import replay_latch
-from dsvla_jax.errors import DataError
+from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action, Camera
@@ -467,3 +467,42 @@ def test_keypoints_of_demonstrations_may_be_those_found_in_the_first_picture():
         assert abs(frame["depth"][round(float(v)), round(float(u))] - depth) < 0.01
         away = np.linalg.norm(point - np.asarray(expert.environment.keypoints(start))[0, 0, 0])
         assert 1e-4 < away < 0.03
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("episodes", 0),
+        ("workers", 0),
+        ("image_size", 0),
+        ("seed", -1),
+        ("perturb", -0.1),
+        ("perturb", np.nan),
+        ("perturb_probability", 1.5),
+        ("batch", 0),
+    ],
+)
+def test_numbers_of_demonstrations_have_their_range(tmp_path, option, value):
+    with pytest.raises(UserError, match=rf"{option}: expected .*, got {value}"):
+        Options(out=tmp_path / "new", tasks=("lamp_on",), **{option: value})
+    if option != "workers":
+        episodes = {"episodes": 1, option: value}
+        with pytest.raises(UserError, match=rf"{option}: expected"):
+            generate_demonstrations(
+                tmp_path / "new", ["lamp_on"], demonstrator=FakeExpert(), progress=False, **episodes
+            )
+    assert not (tmp_path / "new").exists()
+
+
+def test_no_tasks_are_no_success(tmp_path):
+    with pytest.raises(UserError, match="tasks: expected names of tasks, all, single_arm or dual_arm, got none"):
+        main(Options(out=tmp_path, tasks=(",",)))
+
+
+def test_data_made_with_another_reach_of_keypoints_are_refused(folder):
+    """How near an arm must come to a keypoint decides which one a frame is told, and which one a policy will be."""
+    index = json.loads((folder / "index.json").read_text())
+    assert index["reached_radius"] == 0.05
+    (folder / "index.json").write_text(json.dumps({**index, "reached_radius": 0.02}))
+    with pytest.raises(DataError, match=r"reached_radius: expected 0.05 m, got 0.02; make the data again"):
+        EpisodeReader(folder)

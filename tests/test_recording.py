@@ -11,7 +11,7 @@ from data_pipelines.recording import Recording
 from data_pipelines.records import decode_frame
 from data_pipelines.writer import DemonstrationWriter
 from dsvla_jax.encoding.codec import PoseCodec
-from dsvla_jax.errors import DataError
+from dsvla_jax.errors import DataError, UserError
 
 STEPS, SIZE = 12, 16
 SIDE = np.array([[-1, 0, 0, 0.2], [0, -0.6, -0.8, 0.9], [0, -0.8, 0.6, 0.2], [0, 0, 0, 1]])
@@ -242,3 +242,39 @@ def test_another_box_takes_other_poses(tmp_path):
     with DemonstrationWriter(tmp_path, codec=PoseCodec(high=(1.0, 1.0, 3.0))) as writer:
         writer.add(high, keyframes=[5, 11])
     assert EpisodeReader(tmp_path).frame(0)["keypoint"].shape == (0, 3)
+
+
+def test_where_joints_rest_can_be_chosen_and_is_kept(tmp_path, capsys):
+    speeds = np.ones((STEPS, 1, 7))
+    speeds[8] = 0.05
+    with DemonstrationWriter(tmp_path, every_n=0) as writer:
+        assert writer.add(GOOD, joint_velocities=speeds).num_frames == 3
+    assert not capsys.readouterr().err
+    with DemonstrationWriter(tmp_path, every_n=0, still=0.01) as writer:
+        assert writer.add(GOOD, joint_velocities=speeds).num_frames == 2
+        with pytest.raises(
+            DataError, match=r"joint_velocities: expected radians per second, got 57.3 .* divide degrees"
+        ):
+            writer.add(GOOD, joint_velocities=np.rad2deg(speeds))
+    assert "in 1 of 1 recordings the joints never all rest (below 0.01 rad/s)" in capsys.readouterr().err
+    shards = json.loads((tmp_path / "index.json").read_text())["shards"]
+    assert [shard["made_with"] for shard in shards] == [
+        {"every_n": 0, "still": 0.1, "stop_buffer": 4},
+        {"every_n": 0, "still": 0.01, "stop_buffer": 4},
+    ]
+
+
+def test_a_camera_on_the_wrist_need_not_see_the_keypoints(tmp_path):
+    """One that stands still and looks away is refused: see `looks away`."""
+    away = np.tile(CAMERA @ np.diag([1, -1, -1, 1.0]), (STEPS, 1, 1))
+    away[:, 2, 3] += np.linspace(0, 0.2, STEPS)
+    with DemonstrationWriter(tmp_path) as writer:
+        writer.add(make_recording(world_from_camera=away), keyframes=[5, 11])
+    np.testing.assert_allclose(EpisodeReader(tmp_path).episode(0).keypoints, np.array(GOOD.keypoints), atol=1e-6)
+
+
+@pytest.mark.parametrize("option", [{"every_n": -1}, {"still": -0.1}, {"still": np.nan}, {"stop_buffer": -1}])
+def test_numbers_of_the_writer_have_their_range(tmp_path, option):
+    with pytest.raises(UserError, match=f"{next(iter(option))}: expected 0 or more"):
+        DemonstrationWriter(tmp_path / "new", **option)
+    assert not (tmp_path / "new").exists()

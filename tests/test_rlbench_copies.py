@@ -9,7 +9,7 @@ import pytest
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.rlbench.__main__ import Options, Settings, import_demonstrations, main
 from data_pipelines.rlbench.files import find_episodes, read_recording
-from dsvla_jax.errors import DataError
+from dsvla_jax.errors import DataError, UserError
 from tests import rlbench_files as files
 from tests.test_data import assert_equal_episodes
 
@@ -87,8 +87,8 @@ def test_a_copy_with_the_pictures_of_key_poses_only(tmp_path):
     keep_pictures(episode_folder(source), {0, 16, 22, 32})
     with pytest.raises(
         DataError,
-        match=r"front_rgb: folder: expected pictures of all 40 observations, got 4 \(no 1.png\); if they are those of key "
-        r"poses, import with --every-n 0",
+        match=r"front_rgb: folder: expected pictures of all 40 observations, got 4 \(no 1.png\); if they are those of "
+        r"key poses, import with --every-n 0",
     ):
         import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
     assert_equal_episodes(imported(source, tmp_path / "out", every_n=0).episode(0), whole.episode(0))
@@ -161,3 +161,12 @@ def test_the_variation_is_kept_and_what_is_left_aside_is_said(tmp_path, capsys):
     (by_variation / "variation_number.pkl").unlink()
     (folder,) = find_episodes(tmp_path / "upstream")["lamp_on"]
     assert read_recording(folder, "lamp_on")[0].variation == 7
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("every_n", -1), ("still", -0.1), ("stop_buffer", -1), ("episodes", 0), ("episodes", -3), ("camera", "")],
+)
+def test_numbers_of_the_import_have_their_range(tmp_path, option, value):
+    with pytest.raises(UserError, match=rf"{option}: expected .*, got {value}"):
+        Options(source=tmp_path, out=tmp_path / "new", **{option: value})

@@ -18,7 +18,7 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.prompts import Style
-from dsvla_jax.errors import DataError
+from dsvla_jax.errors import DataError, require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +40,9 @@ class Options:
     """Corners of the box that clouds are cut to, metres, as in the config to train with."""
     oxe: OxeConfig = dataclasses.field(default_factory=lambda: OxeConfig(mixture=()))
     """Of RLDS builds, as in the config to train with. With a mixture, displacements are binned over that."""
+
+    def __post_init__(self) -> None:
+        require(self.episodes > 0, "episodes", "at least 1 to draw", self.episodes)
 
 
 def describe(options: Options) -> tuple[Page, str]:

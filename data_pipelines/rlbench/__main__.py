@@ -5,6 +5,8 @@ SRC is a folder of tasks as RLBench's generators write it. OUT receives episodes
 """
 
 import dataclasses
+import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -14,13 +16,20 @@ import tyro
 from tqdm import tqdm
 
 from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
-from data_pipelines.keyframes import discover_keyframes, sample_starts
+from data_pipelines.keyframes import (
+    STILL,
+    STOP_BUFFER,
+    check_velocities,
+    discover_keyframes,
+    ever_rests,
+    sample_starts,
+)
 from data_pipelines.recording import make_demonstration
 from data_pipelines.records import Episode
-from data_pipelines.rlbench.files import find_episodes, read_recording
+from data_pipelines.rlbench.files import find_episodes, left_aside, read_recording
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.digests import file_digest
-from dsvla_jax.errors import DataError
+from dsvla_jax.errors import DataError, require
 from dsvla_jax.files import hold_folder
 
 EPISODES_PER_SHARD = 20
@@ -37,6 +46,16 @@ class Settings:
     keypoints: Literal["contacts", "none"] = "contacts"
     """RLBench records no keypoints. `contacts`: where each gripper opened or closed, and its last pose, looked up in
     the demonstration itself; none: prompts without the keypoint constraint."""
+    still: float = STILL
+    """Radians per second: where all joints are slower than that, the robot has stopped at a key pose."""
+    stop_buffer: int = STOP_BUFFER
+    """Observations after a stop in which no further stop counts."""
+
+    def __post_init__(self) -> None:
+        require(bool(self.camera), "camera", "a name", repr(self.camera))
+        require(self.every_n >= 0, "every_n", "0 or more observations", self.every_n)
+        require(0 <= self.still < math.inf, "still", "0 or more radians per second", self.still)
+        require(self.stop_buffer >= 0, "stop_buffer", "0 or more observations", self.stop_buffer)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +73,10 @@ class Options(Settings):
     skip_bad: bool = False
     """Leave out damaged episodes, and list them, instead of stopping at the first."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.episodes is None or self.episodes > 0, "episodes", "at least 1", self.episodes)
+
 
 def contact_keypoints(pose: np.ndarray, gripper_open: np.ndarray) -> np.ndarray:
     """Where each arm's gripper changed, in time, and where it ended: (T, A, 7) and (T, A) -> (A, K, 3).
@@ -67,14 +90,20 @@ def contact_keypoints(pose: np.ndarray, gripper_open: np.ndarray) -> np.ndarray:
     return np.stack([pose[places[arm], arm, :3] for arm in arms])
 
 
-def import_episode(folder: Path, task: str, number: int, settings: Settings) -> Episode:
-    """One episode folder. Raises DataError where it is damaged."""
-    recording, joint_velocities = read_recording(folder, task, settings.camera)
+def import_episode(folder: Path, task: str, number: int, settings: Settings) -> tuple[Episode, bool]:
+    """One episode folder, and whether its joints ever rest. Raises DataError where it is damaged."""
+    recording, joint_velocities = read_recording(folder, task, settings.camera, key_poses_only=settings.every_n == 0)
+    check_velocities(joint_velocities, folder)
     if settings.keypoints == "contacts":
         points = contact_keypoints(recording.pose, recording.gripper_open)
         recording = dataclasses.replace(recording, keypoints=points)
-    keyframes = discover_keyframes(recording.gripper_open, joint_velocities)
-    return make_demonstration(recording, sample_starts(keyframes, settings.every_n), number, folder)
+    keyframes = discover_keyframes(recording.gripper_open, joint_velocities, settings.still, settings.stop_buffer)
+    fix = (
+        "this camera does not see where the grippers act: choose another --camera, or import without keypoints "
+        "(--keypoints none); if it should see it, its matrix is wrong"
+    )
+    samples = sample_starts(keyframes, settings.every_n)
+    return make_demonstration(recording, samples, number, folder, fix), ever_rests(joint_velocities, settings.still)
 
 
 def origin_name(task: str, folder: Path) -> str:
@@ -126,7 +155,9 @@ def _import_missing(
 ) -> list[dict[str, str]]:
     """Writes the shards that `out` lacks of the episode folders of each task; returns what was left out."""
     wanted = {"importer": "rlbench", **dataclasses.asdict(settings)}
-    entries = {entry["file"]: entry for entry in existing_shards(out, wanted)}
+    # Folders from before these could be chosen.
+    assumed = {"still": STILL, "stop_buffer": STOP_BUFFER}
+    entries = {entry["file"]: entry for entry in existing_shards(out, wanted, assumed)}
     imported = {name: digest for entry in entries.values() for name, digest in entry.get("origin", {}).items()}
     with tqdm(total=sum(map(len, chosen.values())), desc="import", unit="episode", disable=not progress) as bar:
         for task, folders in chosen.items():
@@ -144,17 +175,29 @@ def _import_missing(
                         check_shard(out, entries[name], digest=True)
                         bar.update(len(group))
                         continue
-                good, skipped = [], []
+                good: list[Episode] = []
+                skipped: list[dict[str, str]] = []
+                restless, aside = 0, Counter[str]()
                 for number, folder in enumerate(group, start):
                     try:
-                        good.append(import_episode(folder, task, number, settings))
+                        episode, rests = import_episode(folder, task, number, settings)
+                        good.append(episode)
+                        restless += not rests
+                        aside.update(left_aside(folder, settings.camera))
                     except DataError as error:
                         if not skip_bad:
                             raise
                         skipped.append({"episode": str(folder), "reason": str(error)})
                         origin[origin_name(task, folder)] = None
                     bar.update()
-                entries[name] = write_shard(out, name, task, good, origin=origin, skipped=skipped)
+                notes = {
+                    "origin": origin,
+                    "skipped": skipped,
+                    "variations": sorted({episode.variation for episode in good if episode.variation is not None}),
+                    "restless": restless,
+                    "left_aside": dict(aside),
+                }
+                entries[name] = write_shard(out, name, task, good, **notes)
                 write_index(out, [entries[key] for key in sorted(entries)], wanted)
     return [item for entry in entries.values() for item in entry["skipped"]]
 
@@ -175,8 +218,15 @@ def report(out: Path, skipped: list[dict[str, Any]]) -> None:
     for entry in shards:
         counts[entry["task"]] = counts.get(entry["task"], 0) + len(entry["frames"])
     frames = sum(sum(entry["frames"]) for entry in shards)
+    variations = {(entry["task"], number) for entry in shards for number in entry.get("variations", ())}
     listed = ", ".join(f"{task} {count}" for task, count in counts.items())
-    print(f"{out}: {sum(counts.values())} episodes ({listed}), {frames} samples")
+    print(f"{out}: {sum(counts.values())} episodes ({listed}) of {len(variations)} variations, {frames} samples")
+    if restless := sum(entry.get("restless", 0) for entry in shards):
+        print(f"in {restless} of them the joints never rest: key poses are changes of a gripper and the end (--still)")
+    aside = sum((Counter(entry.get("left_aside", {})) for entry in shards), Counter[str]())
+    if aside:
+        names = ", ".join(f"{name} ({count})" for name, count in sorted(aside.items()))
+        print(f"left aside, folder (episodes): {names}; masks do not say of which object they are")
     if skipped:
         print(f"left out {len(skipped)} damaged episodes:")
         for item in skipped:

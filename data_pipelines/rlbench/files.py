@@ -66,10 +66,13 @@ def _episode_number(path: Path) -> tuple[str, list[tuple[int, str]]]:
     return str(path.parents[2]), [number(path.parents[1].name), number(path.name)]
 
 
-def read_recording(folder: Path, task: str, camera: str = "front") -> tuple[Recording, np.ndarray]:
+def read_recording(
+    folder: Path, task: str, camera: str = "front", key_poses_only: bool = False
+) -> tuple[Recording, np.ndarray]:
     """An episode's recording and its joint velocities (T, A, 7). Pictures are read when asked for.
 
     The instruction is the first of the descriptions, as in PerAct. The recording has no keypoints: RLBench keeps none.
+    key_poses_only: for copies that kept the pictures of key poses only; the others are missed when asked for.
     Raises DataError naming file and observation where anything is missing or damaged.
     """
     path = folder / "low_dim_obs.pkl"
@@ -93,21 +96,35 @@ def read_recording(folder: Path, task: str, camera: str = "front") -> tuple[Reco
             [_numbers(_field(item, "misc", i, path), name, shape, i, path) for i, item in enumerate(observations)]
         )
 
+    _check_camera_name(camera, _field(observations[0], "misc", 0, path), path)
     count = len(observations)
     near, far = seen("near", ()), seen("far", ())
     intrinsics = seen("intrinsics", (3, 3))
     recording = Recording(
         task=task,
         instruction=_instruction(folder),
-        rgb=_Pictures(folder, f"{camera}_rgb", count),
-        depth=_DepthMaps(folder, f"{camera}_depth", count, near, far),
+        rgb=_Pictures(folder, f"{camera}_rgb", count, key_poses_only),
+        depth=_DepthMaps(folder, f"{camera}_depth", count, key_poses_only, near, far),
         intrinsics=intrinsics,
         world_from_camera=seen("extrinsics", (4, 4)),
         pose=felt("gripper_pose", (7,)),
         gripper_open=felt("gripper_open", ()),
+        variation=_variation(folder),
     )
-    _check_variation(folder)
     return recording, felt("joint_velocities", (7,))
+
+
+def left_aside(folder: Path, camera: str) -> list[str]:
+    """The folders of an episode that are not read: masks, point clouds and other cameras."""
+    kinds = {path.name for path in folder.iterdir() if path.is_dir()}
+    return sorted(kinds - {f"{camera}_rgb", f"{camera}_depth"})
+
+
+def _check_camera_name(camera: str, misc: Any, path: Path) -> None:
+    ending = "_camera_extrinsics"
+    cameras = sorted(name.removesuffix(ending) for name in misc if name.endswith(ending))
+    if cameras and not any(name.startswith(f"{camera}_camera_") for name in misc):
+        raise DataError(path, "camera", f"one of {', '.join(cameras)}", repr(camera), "choose one with --camera")
 
 
 def _field(record: Any, name: str, number: int, path: Path) -> Any:
@@ -140,10 +157,10 @@ def _instruction(folder: Path) -> str:
     return texts[0]
 
 
-def _check_variation(folder: Path) -> None:
+def _variation(folder: Path) -> int:
     path = folder / "variation_number.pkl"
     if not path.exists() and folder.parents[1].name != "all_variations":
-        return  # the folder's name says it
+        return int("".join(c for c in folder.parents[1].name if c.isdigit()))
     try:
         number = to_array(read_pickle(path))
     except ValueError as error:
@@ -152,38 +169,62 @@ def _check_variation(folder: Path) -> None:
         raise DataError(path, "variation", "a number", str(error), _FIX) from error
     if number.shape != () or number.dtype.kind not in "iu":
         raise DataError(path, "variation", "a whole number", repr(number.tolist())[:60], _FIX)
+    return int(number)
 
 
 class _Pictures(Sequence[np.ndarray]):
-    """The colour pictures of one camera, read when asked for. Raises DataError unless there is one an observation."""
+    """The colour pictures of one camera, read when asked for.
 
-    def __init__(self, folder: Path, name: str, count: int):
-        self.folder = folder / name
-        kind = name.rsplit("_", 1)[1]
-        files = {path.name for path in self.folder.glob("*.png")}
+    Raises DataError unless there is one an observation; with `key_poses_only` one that is missing is missed when asked
+    for. Any number of leading zeros will do. Hidden files are passed over: archives of macOS have them.
+    """
+
+    def __init__(self, folder: Path, name: str, count: int, key_poses_only: bool):
+        self.folder, self.total, self.key_poses_only = folder / name, count, key_poses_only
+        files = [path.name for path in sorted(self.folder.glob("[!.]*.png"))]
         if not files:
-            raise DataError(self.folder, "folder", f"{count} pictures", "none", _FIX)
-        form = "{}.png" if "0.png" in files else kind + "_{:04d}.png"
-        self.names = [form.format(i) for i in range(count)]
-        if missing := [name for name in self.names if name not in files]:
-            raise DataError(
-                self.folder / missing[0], "file", f"a picture of each of {count} observations", "no such file", _FIX
-            )
-        if len(files) != count:
+            kind = name.rsplit("_", 1)[1]
+            others = sorted({path.parent.name.removesuffix(f"_{kind}") for path in folder.glob(f"*_{kind}/[!.]*.png")})
+            got = f"none, but those of {', '.join(others)}" if others else "none"
+            fix = f"choose one of these with --camera, or {_FIX}" if others else _FIX
+            raise DataError(self.folder, "folder", f"{count} pictures", got, fix)
+        digits = ["".join(c for c in file if c.isdigit()) for file in files]
+        self.names = {int(number): file for number, file in zip(digits, files, strict=True) if number}
+        before, width = files[0][: files[0].find(digits[0])], len(digits[0]) if digits[0].startswith("0") else 1
+        self.form = f"{before}{{:0{width}d}}.png"
+        if 0 not in self.names and count in self.names:
+            fix = "number the files from 0, in the order of the observations"
+            raise DataError(self.folder, "folder", f"pictures 0 to {count - 1}", f"1 to {count}", fix)
+        if len(files) > len(self.names.keys() & range(count)):
             raise DataError(self.folder, "folder", f"{count} pictures, one an observation", str(len(files)), _FIX)
+        missing = [number for number in range(count) if number not in self.names]
+        if missing and not key_poses_only:
+            if len(files) < count / 2:
+                fix = f"if they are those of key poses, import with --every-n 0; otherwise {_FIX}"
+                got = f"{len(files)} (no {self.form.format(missing[0])})"
+                raise DataError(self.folder, "folder", f"pictures of all {count} observations", got, fix)
+            raise self._missing(missing[0])
+
+    def _missing(self, number: int) -> DataError:
+        expected = f"a picture of each of {self.total} observations"
+        if self.key_poses_only:
+            expected = "a picture of the first observation and of each key pose"
+        return DataError(self.folder / self.form.format(number), "file", expected, "no such file", _FIX)
 
     def __len__(self) -> int:
-        return len(self.names)
+        return self.total
 
     def __getitem__(self, number: Any) -> np.ndarray:
-        return read_png(self.folder / self.names[number])
+        if int(number) not in self.names:
+            raise self._missing(int(number))
+        return read_png(self.folder / self.names[int(number)])
 
 
 class _DepthMaps(_Pictures):
     """The depth maps of one camera in metres, 0 where missing."""
 
-    def __init__(self, folder: Path, name: str, count: int, near: np.ndarray, far: np.ndarray):
-        super().__init__(folder, name, count)
+    def __init__(self, folder: Path, name: str, count: int, key_poses_only: bool, near: np.ndarray, far: np.ndarray):
+        super().__init__(folder, name, count, key_poses_only)
         self.near, self.far = near, far
 
     def __getitem__(self, number: Any) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dsvla_jax.errors import UserError
+from dsvla_jax.errors import UserError, require
 from dsvla_jax.perception.keypoints import ONE_END, OTHER_END, Sighting
 from dsvla_jax.perception.phrases import ObjectPhrases, load_table
 
@@ -33,6 +33,9 @@ class GroundingOptions:
     """Torch's name of the device that looks."""
     phrases: Path | None = None
     """A JSON file of {"regular expression": ["phrase", ...]} for instructions that are not the suite's."""
+
+    def __post_init__(self) -> None:
+        require(0 <= self.box_threshold <= 1, "box_threshold", "0 to 1", self.box_threshold)
 
     def segmenter(self) -> "GroundedSegmenter":
         """Loads the models. Raises UserError."""
