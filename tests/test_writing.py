@@ -313,3 +313,32 @@ def test_programs_say_once_that_nothing_is_kept(tmp_path):
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "[2. 2. 2.]\n")
     assert done.stderr == "compiled programs are not kept for the next time: no cache folder can be written\n"
+
+
+def test_sigterm_while_demonstrations_are_made_keeps_what_is_finished(tmp_path, capsys):
+    """Status 75, as of a run that saved and stopped; the same call continues."""
+    expert = FakeExpert()
+
+    def terminated(task, settings):
+        demonstrate = expert(task, settings)
+
+        def attempt(start, count):
+            if start == 4:
+                signal.raise_signal(signal.SIGTERM)
+            return demonstrate(start, count)
+
+        return attempt
+
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    generate_demonstrations(whole, ["lamp_on"], 8, demonstrator=FakeExpert(), batch=4, progress=False)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end:
+        generate_demonstrations(parts, ["lamp_on"], 8, demonstrator=terminated, batch=4, progress=False)
+    assert end.value.code == 75
+    assert "SIGTERM: what was finished is kept, and the same command continues" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert expert.starts == [("lamp_on", 0)]
+    rest = FakeExpert()
+    generate_demonstrations(parts, ["lamp_on"], 8, demonstrator=rest, batch=4, progress=False)
+    assert rest.starts == [("lamp_on", 4), ("lamp_on", 8)]
+    assert contents(parts) == contents(whole)
