@@ -221,6 +221,24 @@ def test_summaries_tell_layers_once():
         ),
         ({"hidden_size": "16"}, "config.json: hidden_size: expected a number, found '16'"),
         ({"num_hidden_layers": 0}, "config.json: num_hidden_layers: expected a positive integer, found 0"),
+        ({"num_hidden_layers": 10**9}, "21 tensors cannot be the 1000000000 layers that its config says"),
+        ({"rms_norm_eps": float("nan")}, "rms_norm_eps: expected a number, found nan"),
+        ({"rms_norm_eps": -1e-5}, "rms_norm_eps: expected a positive number, found -1e-05"),
+        ({"rope_parameters": {"rope_theta": 0}}, "rope_theta: expected a positive number, found 0"),
+        ({"rope_parameters": {"type": "linear", "factor": 2.0}}, "rope_type: supported are .* found 'linear'"),
+        ({"rope_parameters": {"full_attention": {"rope_theta": 5.0}}}, "rope_type 'default': .* found full_attention"),
+        ({"rope_parameters": {"partial_rotary_factor": 0.5}}, "partial_rotary_factor: only 1.0 is supported"),
+        ({"rope_scaling": {"type": "default", "rope_theta": 5.0}}, "rope_scaling and rope_parameters differ"),
+        ({"partial_rotary_factor": 0.5}, "partial_rotary_factor: only 1.0 is supported, found 0.5"),
+        ({"tie_word_embeddings": "false"}, "tie_word_embeddings: expected true or false, found 'false'"),
+        ({"attention_bias": "false"}, "attention_bias: expected true or false"),
+        ({"mlp_bias": True}, r"missing: .*down_proj.bias \(2\), .*gate_proj.bias \(2\), "),
+        ({"sliding_window": 4096}, "sliding_window: only 0 is supported, found 4096"),
+        ({"layer_types": ["full_attention", "sliding_attention"]}, "layer_types: .* found 'sliding_attention'"),
+        ({"final_logit_softcapping": 30.0}, "final_logit_softcapping: only 0 is supported, found 30.0"),
+        ({"attention_multiplier": 0.0156}, "attention_multiplier: only 1.0 is supported"),
+        ({"quantization_config": {"bits": 4}}, "quantization_config: only {} is supported"),
+        ({"auto_map": {"AutoModelForCausalLM": "own.Own"}}, "auto_map: AutoModelForCausalLM: .* code of its own"),
         ({"num_key_value_heads": 3}, "config.json: language: heads 2 is not a multiple of kv_heads 3"),
         ({"vocab_size": 22}, r"00001-of-.*: model.embed_tokens.weight: expected shape \(22, 16\) .* found \(21, 16\)"),
         ({"num_hidden_layers": 1}, r"no place in this architecture for: model.layers.1.input_layernorm.weight, "),
@@ -231,6 +249,54 @@ def test_another_architecture_is_refused(sharded, changes, message):
     change_json(sharded / "config.json", **changes)
     with pytest.raises(WeightsError, match=message):
         read_language(sharded)
+
+
+def test_fields_that_change_nothing_are_no_hindrance(sharded):
+    fields = {"sliding_window": 9, "use_sliding_window": False, "partial_rotary_factor": None, "rope_scaling": None}
+    change_json(sharded / "config.json", **fields, layer_types=["full_attention"] * 2, auto_map={"AutoTokenizer": "x"})
+    assert read_language(sharded).config == read_language(GOLDEN / "llama_sharded").config
+
+
+CLIP_NUMBERS = {"image_mean": [0.48145466, 0.4578275, 0.40821073], "image_std": [0.26862954, 0.26130258, 0.27577711]}
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("preprocessor_config.json", CLIP_NUMBERS | {"rescale_factor": 0.00392156862745098}, None),
+        ("preprocessor_config.json", CLIP_NUMBERS | {"image_mean": [0.5, 0.5, 0.5]}, "image_mean: only CLIP's 0.4815"),
+        ("preprocessor_config.json", {"image_std": 0.5}, "image_std: only CLIP's 0.2686, 0.2613, 0.2758 is supported"),
+        ("preprocessor_config.json", {"do_normalize": False}, "do_normalize: only True is supported"),
+        ("processor_config.json", {"image_processor": {"rescale_factor": 1.0}}, "rescale_factor: only CLIP's 0.00392"),
+        ("config.json", {"vision_config_dict": {"hidden_act": "gelu"}}, "hidden_act: only 'gelu' .* 'quick_gelu'"),
+        ("config.json", {"vision_config_dict": {"hidden_act": "quick_gelu", "num_hidden_layers": None}}, None),
+    ],
+)
+def test_a_tower_for_other_pictures_is_refused(tmp_path, file, content, message):
+    folder = Path(shutil.copytree(GOLDEN / "clip", tmp_path / "source"))
+    known = json.loads((folder / file).read_text()) if (folder / file).exists() else {}
+    (folder / file).write_text(json.dumps(known | content))
+    if message is None:
+        assert read_vision(folder).config == read_vision(GOLDEN / "clip").config
+        return
+    with pytest.raises(WeightsError, match=message):
+        read_vision(folder)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"image_size": 0}, "image size: expected 1 to 4096 pixels, got 0"),
+        ({"image_size": -9}, "image size: expected 1 to 4096 pixels, got -9"),
+        ({"image_size": 300_000}, "image size: expected 1 to 4096 pixels"),
+        ({"adapter": GOLDEN / "original" / "adapter.pth", "adapter_heads": 0}, "heads .* expected at least 1, got 0"),
+        ({"adapter_heads": 3}, "heads .* need an adapter"),
+    ],
+)
+def test_options_out_of_range_are_refused_before_anything_is_written(tmp_path, options, message):
+    with pytest.raises(WeightsError, match=message):
+        import_backbones(GOLDEN / "llama_sharded", tmp_path / "out", GOLDEN / "clip", **options)
+    assert not list(tmp_path.iterdir())
 
 
 def cut(file, keep):
@@ -262,6 +328,16 @@ def other_map(folder):
     change_json(file, weight_map=json.loads(file.read_text())["weight_map"] | {"model.extra": SHARD})
 
 
+def two_models(folder):
+    shutil.copy(folder / SHARD, folder / "model.safetensors")
+
+
+def twice(folder):
+    shutil.copy(folder / SHARD, folder / "model-00004-of-00003.safetensors")
+    file = folder / "model.safetensors.index.json"
+    change_json(file, weight_map=json.loads(file.read_text())["weight_map"] | {"x": "model-00004-of-00003.safetensors"})
+
+
 def outside(folder):
     file = folder / "model.safetensors.index.json"
     change_json(file, weight_map={"model.embed_tokens.weight": f"../source/{SHARD}"})
@@ -277,6 +353,8 @@ def outside(folder):
         (lambda f: (f / SHARD).unlink(), "00002-of-00003.safetensors: this shard is missing, .*index.json names it"),
         (outside, "00002-of-00003.safetensors: this shard is missing"),
         (other_map, "00002-of-00003.safetensors: model.extra is not in it, though .*index.json says so"),
+        (two_models, "source: holds two models, model.safetensors and model.safetensors.index.json"),
+        (twice, rf"00004-of-00003.safetensors: model\.\S+ is in {SHARD} already"),
         (no_index, r"index.json: missing, so it is unknown whether model-00001-\S+, \S+, \S+ is all"),
         (only_pickles, "source: holds neither model.safetensors nor .* save_pretrained"),
         (eight_bit, r"00002-of-00003.safetensors: model\.\S+: expected dtype F32, F16, BF16, found F8E4"),
@@ -291,6 +369,30 @@ def test_damage_is_told_with_file_and_key(sharded, damage, message):
     with pytest.raises(WeightsError, match=message):
         import_backbones(sharded, out)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("offered", ["adapter", "adapter/adapter_model.safetensors", "model"])
+@pytest.mark.parametrize("option", ["source", "vision_source", "adapter"])
+def test_an_adapter_of_peft_is_called_one(tmp_path, sharded, offered, option):
+    """By itself, as any of the sources; and beside a model, which transformers would add it to."""
+    tensors = {"base_model.model.model.layers.0.self_attn.q_proj.lora_A.weight": np.zeros((2, 16), np.float32)}
+    folder = write_checkpoint(tmp_path / "adapter", {}, tensors)
+    (folder / "config.json").unlink()
+    (folder / "model.safetensors").rename(folder / "adapter_model.safetensors")
+    config = {"peft_type": "LORA", "base_model_name_or_path": "meta-llama/Llama-2-7b-hf"}
+    (folder / "adapter_config.json").write_text(json.dumps(config))
+    shutil.copytree(folder, shutil.copytree(sharded, tmp_path / "model"), dirs_exist_ok=True)
+    sources = {"source": sharded, "vision_source": GOLDEN / "clip", option: tmp_path / offered}
+    with pytest.raises(WeightsError, match=r"an adapter of PEFT .*'meta-llama/Llama-2-7b-hf'.*merge_and_unload"):
+        import_backbones(out=tmp_path / "out", **sources)
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_where_folders_are_expected_say_so(tmp_path):
+    with pytest.raises(WeightsError, match=r"model.safetensors: a safetensors file, no PyTorch checkpoint; name its"):
+        read_vision(GOLDEN / "clip" / "model.safetensors")
+    with pytest.raises(WeightsError, match=r"model.safetensors: a file; expected the folder of a Hugging Face"):
+        read_language(GOLDEN / "clip" / "model.safetensors")
 
 
 def test_a_file_cut_anywhere_is_an_error(sharded):

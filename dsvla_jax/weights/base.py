@@ -30,6 +30,8 @@ VARIABLES = {
 }
 # What the sizes of a tower are called in a ModelConfig, where that is another name.
 NAMES_IN_MODEL = {"projector": "visual_prompt"}
+# Pixels along a side; positional embeddings of more would fill the memory.
+LARGEST_IMAGE = 4096
 # What is trained further is not rounded.
 TRAINED = ("projector", "lora")
 
@@ -68,6 +70,12 @@ def import_backbones(
         raise WeightsError(
             "image size, projection and adapter need a vision tower: name the source that has one (--vision)"
         )
+    if image_size is not None and not 0 < image_size <= LARGEST_IMAGE:
+        raise WeightsError(f"image size: expected 1 to {LARGEST_IMAGE} pixels, got {image_size}")
+    if adapter_heads < 1:
+        raise WeightsError(f"heads of the adapter's visual blocks: expected at least 1, got {adapter_heads}")
+    if adapter is None and adapter_heads != VisualPromptConfig().heads:
+        raise WeightsError("heads of the adapter's visual blocks need an adapter: name its file (--adapter)")
     towers = {"language": read_language(source)}
     if vision_source is not None:
         towers["vision"] = read_vision(vision_source, image_size, projection or adapter is not None)

@@ -62,6 +62,10 @@ def export_run(run: Path, out: Path, model: ModelConfig, tokenizer: Tokenizer, o
     Raises CheckpointError where ``out`` exists or the run has not ``model``'s sizes, UserError where there are no
     adapters to write, or where they cannot be merged.
     """
+    if not options.shard_bytes > 0:  # NaN too
+        raise UserError(f"size of a file: expected more than 0 GB, got {options.shard_bytes / 1e9:g}")
+    if options.merged and any(options.bases.values()):
+        raise UserError("a base is noted in adapters only: leave it out, or export without --merged")
     with new_folder(out) as folder:
         return _write_run(run, folder, model, tokenizer, options)
 
@@ -82,6 +86,9 @@ def _write_run(run: Path, folder: Path, model: ModelConfig, tokenizer: Tokenizer
             require_mergeable(tree)
         except ValueError as error:
             raise UserError(f"{run}: {error}; without --merged they are exported as they are") from error
+
+    if foreign := [tower for tower, base in options.bases.items() if base and tower not in towers]:
+        raise UserError(f"{run}: no adapters in its {' and '.join(foreign)} tower: leave out that tower's base")
 
     shutil.copy(run / "policy.json", folder)
     for tower in towers:

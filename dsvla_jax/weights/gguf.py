@@ -29,6 +29,16 @@ NAMES = {
 }
 
 
+# What the metadata of a LLaMA may say. context_length only bounds, and the layout is told from the names.
+KEYS = (
+    *("context_length", "embedding_length", "block_count", "feed_forward_length", "vocab_size", "tensor_data_layout"),
+    *("attention.head_count", "attention.head_count_kv", "attention.key_length", "attention.value_length"),
+    *("attention.layer_norm_rms_epsilon", "expert_count", "expert_used_count"),
+    *("rope.dimension_count", "rope.freq_base", "rope.scaling.type", "rope.scaling.factor", "rope.scale_linear"),
+    *("rope.scaling.original_context_length", "rope.scaling.finetuned"),
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class QuantizedTensor(StoredTensor):
     """A tensor in one of GGML's formats: blocks of numbers along the last axis. dtype: the format's name."""
@@ -82,7 +92,8 @@ def read_language(file: Path) -> Tower:
         )
         for tensor in reader.tensors
     }
-    section = Section(file, {name.removeprefix("llama."): value for name, value in values.items()})
+    own = {name: value for name, value in values.items() if name.startswith("llama.")}
+    section = Section(file, {name.removeprefix("llama."): value for name, value in own.items()})
     config = _config(section, tensors)
     rotated = ("attn_q.weight", "attn_k.weight")
     paired = {
@@ -96,10 +107,17 @@ def _config(section: Section, tensors: dict[str, QuantizedTensor]) -> LanguageCo
     embedding = tensors.get(NAMES["embedding"])
     if embedding is None:
         raise WeightsError(f"{section.file}: {NAMES['embedding']} is missing")
+    section.only(KEYS, "metadata of a LLaMA")
     section.require("rope.scaling.type", "none")
+    for name in ("rope.scaling.factor", "rope.scale_linear"):
+        section.require(name, 1.0)
+    for name in ("expert_count", "expert_used_count"):
+        section.require(name, 0)
     width, heads = section.integer("embedding_length", 0), section.integer("attention.head_count", 0)
     head_dim = section.integer("attention.key_length", width // heads)
     section.require("rope.dimension_count", head_dim)
+    section.require("attention.value_length", head_dim)
+    section.require("vocab_size", embedding.shape[0])
     try:
         return LanguageConfig(
             vocab_size=embedding.shape[0],
@@ -108,8 +126,8 @@ def _config(section: Section, tensors: dict[str, QuantizedTensor]) -> LanguageCo
             heads=heads,
             kv_heads=section.integer("attention.head_count_kv", heads),
             ffn=section.integer("feed_forward_length", 0),
-            rope_theta=float(section.number("rope.freq_base", 10000.0)),
-            norm_eps=float(section.number("attention.layer_norm_rms_epsilon", 1e-5)),
+            rope_theta=section.positive("rope.freq_base", 10000.0),
+            norm_eps=section.positive("attention.layer_norm_rms_epsilon", 1e-5),
             tie_embeddings=NAMES["output"] not in tensors,
             explicit_head_dim=None if head_dim * heads == width else head_dim,
         )

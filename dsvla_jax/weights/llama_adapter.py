@@ -22,6 +22,7 @@ from dsvla_jax.model.config import (
 )
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.weights.original import META_BLOCKS, META_LINEAR, META_NAMES, in_rotary_pairs
+from dsvla_jax.weights.peft_adapters import refuse_peft_adapter
 from dsvla_jax.weights.tensors import StoredTensor, WeightsError
 from dsvla_jax.weights.torch_files import list_tensors
 from dsvla_jax.weights.towers import Place, Tower, assign, find_prefix, flat_shapes
@@ -63,6 +64,7 @@ def read_adapter(file: Path, language: LanguageConfig, vision: VisionConfig, hea
     LLaMA's and CLIP's own weights may be in the file too; they are left alone.
     Raises WeightsError naming file and key where anything does not fit.
     """
+    refuse_peft_adapter(file)
     everything = list_tensors(file)
     prefix = find_prefix(everything, "adapter_query.weight", file)
     tensors = {key.removeprefix(prefix): tensor for key, tensor in everything.items() if key.startswith(prefix)}
@@ -121,8 +123,10 @@ def _adapters(decoder: Mapping[str, StoredTensor], language: LanguageConfig, fil
     targets = tuple(name for name in LORA_TARGETS if names[f"layers/{name}/a"].format(0) in tensors)
     if not targets:
         return None
-    rank = tensors[names[f"layers/{targets[0]}/a"].format(0)].shape[0]
-    lora = LoraConfig(rank=rank, alpha=float(rank), targets=targets, towers=("language",))
+    first = tensors[names[f"layers/{targets[0]}/a"].format(0)]
+    if len(first.shape) != 2 or not first.shape[0]:
+        raise WeightsError(f"{file}: {first.key}: expected a matrix of rank x inputs, found shape {first.shape}")
+    lora = LoraConfig(rank=first.shape[0], alpha=float(first.shape[0]), targets=targets, towers=("language",))
     shapes = flat_shapes(_variables(ModelConfig(language=language, lora=lora))["lora"]["language"])
     return assign(lora, shapes, names, tensors, file)
 

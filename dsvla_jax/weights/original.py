@@ -18,6 +18,11 @@ from dsvla_jax.weights.torch_files import list_tensors
 from dsvla_jax.weights.towers import AXES, Tower, assign, find_prefix, tower_shapes
 
 PARAMS = "params.json"
+# What it may say. The sizes that multiple_of and ffn_dim_multiplier decide are those of the tensors.
+PARAMS_READ = (
+    *("dim", "n_layers", "n_heads", "n_kv_heads", "vocab_size", "norm_eps", "rope_theta", "use_scaled_rope"),
+    *("multiple_of", "ffn_dim_multiplier", "max_batch_size", "max_seq_len", "model_parallel_size"),
+)
 # A constant that Meta's files have beside the parameters, and that Meta's code does not read.
 FREQUENCIES = "rope.freqs"
 
@@ -106,18 +111,22 @@ def _meta_config(section: Section, tensors: Mapping[str, StoredTensor], file: Pa
             raise WeightsError(f"{file}: wrong architecture: {key} is missing")
         return tensors[key].shape[0]
 
+    section.only(PARAMS_READ, "sizes of a LLaMA")
     heads = section.integer("n_heads", 32)
-    scaled = section.values.get("use_scaled_rope", False)
+    scaled = section.flag("use_scaled_rope")
+    vocab_size = rows("tok_embeddings.weight")
+    if section.number("vocab_size", -1) > 0:  # the first LLaMA's says -1
+        section.require("vocab_size", vocab_size)
     try:
         return LanguageConfig(
-            vocab_size=rows("tok_embeddings.weight"),
+            vocab_size=vocab_size,
             width=section.integer("dim", 4096),
             layers=section.integer("n_layers", 32),
             heads=heads,
             kv_heads=section.integer("n_kv_heads", heads),
             ffn=rows("layers.0.feed_forward.w1.weight"),
-            rope_theta=float(section.number("rope_theta", 10000.0)),
-            norm_eps=float(section.number("norm_eps", 1e-5)),
+            rope_theta=section.positive("rope_theta", 10000.0),
+            norm_eps=section.positive("norm_eps", 1e-5),
             tie_embeddings=False,
             rope_scaling=RopeScaling() if scaled else None,
         )
@@ -172,7 +181,7 @@ def _clip_config(tensors: Mapping[str, StoredTensor], file: Path) -> VisionConfi
         return tensors[key].shape
 
     width, _, _, patch = shape("conv1.weight", 4)
-    grid = math.isqrt(shape("positional_embedding", 2)[0] - 1)
+    grid = math.isqrt(max(shape("positional_embedding", 2)[0] - 1, 0))
     layers = {match[1] for key in tensors if (match := re.match(r"transformer\.resblocks\.(\d+)\.", key))}
     try:
         return VisionConfig(
@@ -184,5 +193,5 @@ def _clip_config(tensors: Mapping[str, StoredTensor], file: Path) -> VisionConfi
             mlp_ratio=shape("transformer.resblocks.0.mlp.c_fc.weight", 2)[0] / width,
             embed_width=shape("proj", 2)[1],
         )
-    except ValueError as error:
+    except (ValueError, ZeroDivisionError) as error:
         raise WeightsError(f"{file}: {error}") from error

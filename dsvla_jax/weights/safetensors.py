@@ -17,6 +17,8 @@ INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
 
 def read_json(file: Path) -> dict[str, Any]:
     """A JSON object. Raises WeightsError naming the file where it is missing or something else."""
+    if file.parent.is_file():
+        raise WeightsError(f"{file.parent}: a file; expected the folder of a Hugging Face checkpoint, which it lies in")
     if not file.is_file():
         raise WeightsError(f"{file}: missing; expected the folder of a Hugging Face checkpoint")
     try:
@@ -30,9 +32,11 @@ def read_json(file: Path) -> dict[str, Any]:
 
 def list_tensors(folder: Path) -> dict[str, StoredTensor]:
     """Every tensor of a checkpoint, from the headers of its one file or its shards; no tensor is read."""
-    if (folder / INDEX).is_file():
-        return _list_shards(folder)
     file = folder / SINGLE
+    if (folder / INDEX).is_file():
+        if file.is_file():
+            raise WeightsError(f"{folder}: holds two models, {SINGLE} and {INDEX} with its shards; keep one of them")
+        return _list_shards(folder)
     if file.is_file():
         return _list_file(file)
     others = sorted(path.name for path in folder.glob("*.safetensors"))
@@ -54,7 +58,10 @@ def _list_shards(folder: Path) -> dict[str, StoredTensor]:
         shard = folder / name
         if shard.name != name or not shard.is_file():
             raise WeightsError(f"{shard}: this shard is missing, {index.name} names it; {AGAIN}")
-        tensors |= _list_file(shard)
+        more = _list_file(shard)
+        if twice := sorted(tensors.keys() & more.keys()):
+            raise WeightsError(f"{shard}: {twice[0]} is in {tensors[twice[0]].file.name} already; {AGAIN}")
+        tensors |= more
     for key, name in weight_map.items():
         if key not in tensors or tensors[key].file.name != name:
             raise WeightsError(f"{folder / name}: {key} is not in it, though {index.name} says so; {AGAIN}")

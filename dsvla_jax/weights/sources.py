@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from dsvla_jax.weights import from_hugging_face, gguf, original
+from dsvla_jax.weights.peft_adapters import refuse_peft_adapter
 from dsvla_jax.weights.towers import Tower, resample
 
 
@@ -11,6 +12,7 @@ def read_language(source: Path) -> Tower:
 
     Raises WeightsError naming file and key where anything is missing, damaged, left over, or of another architecture.
     """
+    refuse_peft_adapter(source)
     if source.suffix == ".gguf":
         return gguf.read_language(source)
     if (source / original.PARAMS).is_file():
@@ -24,6 +26,7 @@ def read_vision(source: Path, image_size: int | None = None, projection: bool = 
     image_size: pixels; None for the checkpoint's own. Positional embeddings are resampled to another size's grid.
     projection: read the projection into CLIP's joint embedding too. Raises WeightsError as `read_language` does.
     """
+    refuse_peft_adapter(source)
     read = original.read_openai_vision if source.is_file() else from_hugging_face.read_vision
     tower = read(source, projection)
     return tower if image_size in (None, tower.config.image_size) else resample(tower, image_size, source)

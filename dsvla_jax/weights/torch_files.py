@@ -109,10 +109,7 @@ def list_tensors(file: Path) -> dict[str, StoredTensor]:
     if not file.is_file():
         raise WeightsError(f"{file}: missing; expected a PyTorch checkpoint")
     if not zipfile.is_zipfile(file):
-        with file.open("rb") as stream:
-            pickled = stream.read(1) == b"\x80"
-        problem = f"written by a PyTorch before 1.6; {SAVE_AGAIN}" if pickled else f"no zip archive: cut short; {AGAIN}"
-        raise WeightsError(f"{file}: {problem}")
+        raise WeightsError(f"{file}: {_no_archive(file)}")
     try:
         with zipfile.ZipFile(file) as archive:
             root = next(name for name in archive.namelist() if name.endswith("/data.pkl")).removesuffix("data.pkl")
@@ -128,6 +125,17 @@ def list_tensors(file: Path) -> dict[str, StoredTensor]:
     tensors: dict[str, StoredTensor] = {}
     _collect(content, (), tensors)
     return tensors
+
+
+def _no_archive(file: Path) -> str:
+    """What a file is that is no zip archive, and what to do about it."""
+    with file.open("rb") as stream:
+        begin = stream.read(9)
+    if begin[:1] == b"\x80":
+        return f"written by a PyTorch before 1.6; {SAVE_AGAIN}"
+    if begin[8:] == b"{":
+        return "a safetensors file, no PyTorch checkpoint; name its folder, which has the config.json, as the source"
+    return f"no zip archive: cut short; {AGAIN}"
 
 
 def _storages(file: Path, archive: zipfile.ZipFile, prefix: str) -> dict[str, tuple[int, int]]:

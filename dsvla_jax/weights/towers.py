@@ -127,6 +127,8 @@ def assign(
     that is another one.
     Raises WeightsError naming files and keys.
     """
+    if (layers := max(shape[0] for path, shape in shapes.items() if path.split("/")[0] in STACKED)) > len(tensors):
+        raise WeightsError(f"{source}: {len(tensors)} tensors cannot be the {layers} layers that its config says")
     keys = {place: names[place[0]].format(place[1]) for place in _places(shapes)}
     used = set(keys.values())
     missing = [key for key in used if key not in tensors]
@@ -183,7 +185,7 @@ def tower_shapes(config: LanguageConfig | VisionConfig) -> dict[str, tuple[int, 
         model = VisionTower(ModelConfig(vision=config))
         inputs = ((1, config.image_size, config.image_size, 3), (1, 0, config.width), (1, 0))
     first, *rest = inputs
-    arrays = jnp.zeros(first), *(jnp.zeros(shape, int) for shape in rest)
+    arrays = jax.ShapeDtypeStruct(first, jnp.float32), *(jax.ShapeDtypeStruct(shape, jnp.int32) for shape in rest)
     return flat_shapes(jax.eval_shape(model.init, jax.random.key(0), *arrays)["params"])
 
 
