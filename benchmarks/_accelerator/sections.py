@@ -28,6 +28,7 @@ class Sizes:
     keyframes: int = 8
     """At most so many in an episode of the device loop; fewer for tasks whose experts need less than half."""
     rollouts: int = 3
+    render_tasks: tuple[str, ...] = ("lamp_on", "stack_blocks")
     pixels: tuple[int, ...] = (64, 128, 336)
     frames: int = 128
     """Rendered at a time."""
@@ -54,17 +55,18 @@ SIZES = {
         product=64,
         train_batches=(2,),
         train_steps=2,
-        robots=(1, 2),
+        robots=(2,),
         actions=2,
         episodes=(2,),
         keyframes=2,
         rollouts=1,
-        pixels=(16, 32),
+        pixels=(16,),
         frames=2,
-        clouds=(1, 2),
+        clouds=(2,),
         repeats=2,
-        picture_tasks=("lamp_on", "close_fridge"),
-        pictures=4,
+        render_tasks=("lamp_on",),
+        picture_tasks=("lamp_on",),
+        pictures=8,
         picture_pixels=32,
         compared=2,
     ),

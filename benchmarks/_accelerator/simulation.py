@@ -55,10 +55,14 @@ def policy_to_run(job: Job) -> tuple[Policy, Experiment, bool]:
 
 
 def starts(task: str, image_size: int, split: str, count: int) -> SimState:
-    """``count`` reset states, of which not all differ. C MuJoCo settles them, which spares a program of MJX."""
+    """``count`` reset states. C MuJoCo settles them, which spares a program of MJX."""
     environment = Environment(task, image_size=image_size)
-    state = environment.reset(episode_keys(0, split, task, 0, min(count, STARTS)))
-    return jax.tree.map(lambda x: jnp.asarray(np.resize(np.asarray(x), (count, *np.shape(x)[1:]))), state)
+    return jax.tree.map(jnp.asarray, environment.reset(episode_keys(0, split, task, 0, count)))
+
+
+def repeated(tree: Any, count: int) -> Any:
+    """A tree of arrays with a leading axis, whose rows are repeated until there are ``count``."""
+    return jax.tree.map(lambda x: jnp.asarray(np.resize(np.asarray(x), (count, *np.shape(x)[1:]))), tree)
 
 
 def device_loop(job: Job, task: str) -> None:
@@ -68,11 +72,12 @@ def device_loop(job: Job, task: str) -> None:
     environment = Environment(task, "mjx", image_size=experiment.data.image_size)
     limit = min(2 * environment.expert_keyframes, job.sizes.keyframes)
     job.note(keyframes_limit=limit)
-    rollouts = {}
-    for count in job.sizes.episodes:
-        state = starts(task, experiment.data.image_size, "eval", count)
-        keypoints = first_keypoints(environment, state, experiment.keypoints)
-        rollouts[count] = partial(DeviceRollout(environment, policy, limit), state, keypoints)
+    state = starts(task, experiment.data.image_size, "eval", min(STARTS, max(job.sizes.episodes)))
+    keypoints = first_keypoints(environment, state, experiment.keypoints)
+    rollouts = {
+        count: partial(DeviceRollout(environment, policy, limit), *repeated((state, keypoints), count))
+        for count in job.sizes.episodes
+    }
     # All at once, because their compiling takes far longer than they do.
     with ThreadPoolExecutor(len(rollouts)) as pool:
         _, seconds = call(lambda: [one.result() for one in [pool.submit(rollout) for rollout in rollouts.values()]])
@@ -102,8 +107,8 @@ def device_loop(job: Job, task: str) -> None:
 
 def render(job: Job) -> None:
     """Frames a second of colour, depth and segmentation by their size."""
-    for task in ("lamp_on", "stack_blocks"):
-        state = starts(task, 96, "validation", job.sizes.frames)
+    for task in job.sizes.render_tasks:
+        state = repeated(starts(task, 96, "validation", min(STARTS, job.sizes.frames)), job.sizes.frames)
         for pixels in job.sizes.pixels:
             environment = Environment(task, image_size=pixels)
             _, timing = timed(partial(environment.render, state), job.sizes.repeats, ROLLOUT_SECONDS / 4)

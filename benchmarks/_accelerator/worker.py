@@ -66,11 +66,17 @@ def say(began: float, name: str, text: str) -> None:
 
 def main(out: str, folder: str, size: str, began: str, until: str, *names: str) -> int:
     """Runs the sections of these names; the arguments are those of `run_sections`, and the report's file."""
+    import jax
+
     from dsvla_jax.command_line import configure_jax
 
-    sections = choose(names)
+    sections, report = choose(names), Report(Path(out))
     configure_jax("mjx" if any(name.startswith("mjx") or name == "equal_episodes" for name in names) else "mujoco")
-    fine = run_sections(sections, SIZES[size], Report(Path(out)), Path(folder), float(began), float(until))
+    if size == "full" and jax.default_backend() == "cpu":
+        for name in names:
+            report.update(name, state=FAILED, error="JAX has no accelerator here; on a CPU use --size toy")
+        return SECTION_FAILED
+    fine = run_sections(sections, SIZES[size], report, Path(folder), float(began), float(until))
     return 0 if fine else SECTION_FAILED
 
 
