@@ -260,6 +260,12 @@ class RunCheckpoints:
             self._manager.close()
 
 
+def has_checkpoints(run: Path) -> bool:
+    """Whether a run folder holds a checkpoint, be it a damaged one."""
+    folder = run / "checkpoints"
+    return bool(_steps(folder)) or (folder / "damaged").exists()
+
+
 def _steps(folder: Path) -> list[int]:
     """The steps that are in the folder under their final names."""
     return sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())

@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import cattrs
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.config_files import read_config
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
@@ -22,10 +22,12 @@ from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
 from dsvla_jax.model.layers_apart import take_apart
 from dsvla_jax.model.partition import shardings
+from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import Action, Array, ModelInputs, Observation
@@ -39,6 +41,9 @@ class PolicyConfig:
     model: ModelConfig
     displacement: DisplacementScale | None = None
     """The range of answers that say where to go from the present pose; None for answers that are poses."""
+
+    def __post_init__(self) -> None:
+        require_same_sizes(self.encoding, self.model)
 
 
 # Batches are filled up to one of these sizes, so that any size runs without compiling again; beyond, to a multiple of
@@ -169,11 +174,9 @@ def load_policy_config(run: Path) -> PolicyConfig:
             f"{run}: no run here (policy.json is missing); train one: python train.py CONFIG --run {run}"
         )
     try:
-        return cattrs.Converter(forbid_extra_keys=True).structure(json.loads(file.read_text()), PolicyConfig)
-    except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
-        raise CheckpointError(
-            f"{file}: not a policy of this version of dsvla_jax ({error}); train the run again"
-        ) from error
+        return read_config(file, PolicyConfig, "a policy")
+    except UserError as error:
+        raise CheckpointError(f"{error}; train the run again") from error
 
 
 def load(
