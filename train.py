@@ -26,58 +26,92 @@ from data_pipelines.first_look import fit_workspace, look_at_demonstrations, loo
 from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.loader import make_loader
 from data_pipelines.samples import make_sampler, make_validation_sampler, suite_tokenizer
-from data_pipelines.sources import choose_tasks, open_demonstrations, open_held_out
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints, require_same_shapes, require_writable_path
-from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory
+from data_pipelines.sources import (
+    choose_tasks,
+    open_demonstrations,
+    open_held_out,
+    require_data_fits,
+    require_oxe_fits,
+)
+from dsvla_jax.checkpoints import RunCheckpoints, has_checkpoints, require_same_shapes, require_writable_path
+from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory, parse_options
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
-from dsvla_jax.files import hold_folder
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
+from dsvla_jax.ranges import require
 from dsvla_jax.rollout import Stopped, run_task
 from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.tasks import TASKS, select_tasks
 from dsvla_jax.training import loop
 from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes
-from dsvla_jax.training.experiment import Experiment, load_experiment, outcome_differences, save_experiment
-from dsvla_jax.training.metrics import MetricsWriter
+from dsvla_jax.training.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
+from dsvla_jax.training.metrics import MetricsWriter, require_wandb
+from dsvla_jax.training.preflight import check_step
 from dsvla_jax.training.profile import trace_steps
+from dsvla_jax.training.run_folder import only_one_process, remove_other_start, require_same_experiment, run_folder
 from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch
 from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
-from dsvla_jax.weights.base import is_imported, load_for_model
+from dsvla_jax.weights.base import is_imported, load_for_model, require_base
 
 # Embeddings have more rows than the vocabulary has tokens where their number was rounded up, by fewer than so many.
 PADDING_ROWS = 1024
 
 
-def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "", profile: int = 0) -> int:
-    """Trains one experiment into the run folder, or goes on from its newest checkpoint. Returns the exit status."""
+def prepare(
+    experiment: Experiment, run: Path
+) -> tuple[Experiment, Tokenizer, jax.sharding.Mesh, BatchPart, tuple[int, int]]:
+    """The experiment with the names of its tasks, its vocabulary, the mesh, this process's part of a batch, and height
+    and width of the pictures that it learns from. Writes nothing but demonstrations to fit the workspace to.
+
+    Raises UserError, naming the options, where settings contradict one another, the vocabulary, the base, the pictures,
+    or what the run folder holds.
+    """
     require_writable_path(run)
     tokenizer = tokenizer_of(experiment)
     if experiment.oxe is None:
         tasks = choose_tasks(experiment.data)
         experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     require_possible(experiment)
-    experiment = with_workspace(experiment, run, tokenizer)
     mesh = make_mesh(experiment.mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
+    if experiment.base:
+        require_base(Path(experiment.base), experiment.model)
+    held_out = experiment.validation.episodes if experiment.validate_every else 0
+    if experiment.oxe is not None:
+        picture = require_oxe_fits(experiment.oxe, experiment.encoding, tokenizer)
+    else:
+        picture = require_data_fits(experiment.data, experiment.encoding, tokenizer, held_out)
+    experiment = with_workspace(experiment, run, tokenizer)
     require_same_experiment(run, experiment)
-    run.mkdir(parents=True, exist_ok=True)
+    return experiment, tokenizer, mesh, part, picture
+
+
+def main(experiment: Experiment, run: Path, watchdog: Watchdog, wandb: str = "", profile: int = 0) -> int:
+    """Trains one experiment into the run folder, or goes on from its newest checkpoint. Returns the exit status."""
+    require(profile >= 0, "profile", "at least 0", profile)
+    if wandb:
+        require_wandb()
+    experiment, tokenizer, mesh, part, picture = prepare(experiment, run)
+    check_step(experiment, mesh, picture)
     with (
+        run_folder(run),
         only_one_process(run),
         contextlib.closing(RunCheckpoints(run, keep=experiment.keep_checkpoints)) as checkpoints,
     ):
         if checkpoints.latest_step == experiment.steps:
             print(f"{run} has been trained to step {experiment.steps}: nothing to do")
             return 0
+        if checkpoints.latest_step is None:
+            remove_other_start(run, experiment)
         stopped = train(experiment, run, tokenizer, checkpoints, mesh, part, watchdog, wandb, profile)
         step_reached = checkpoints.latest_step
     if stopped is not None:
@@ -241,7 +275,11 @@ def make_evaluation(
 
 
 def require_possible(experiment: Experiment) -> None:
-    """Raises UserError where training cannot be watched as asked for."""
+    """Raises UserError where training cannot be scheduled or watched as asked for."""
+    warmup = experiment.optimizer.warmup_steps
+    # The default suits every run, because warm-up is a fifth of it at most.
+    if warmup > experiment.steps and warmup != OptimizerConfig().warmup_steps:
+        raise UserError(f"optimizer.warmup_steps: expected at most steps ({experiment.steps}), got {warmup}")
     if experiment.evaluate_every:
         if experiment.oxe is not None:
             raise UserError("evaluate_every: the simulator has no tasks of Open X-Embodiment; set it to 0")
@@ -252,6 +290,8 @@ def require_possible(experiment: Experiment) -> None:
                 "eval.py RUN"
             )
         select_tasks(experiment.data.tasks)
+        size = experiment.data.image_size
+        experiment.encoding.require_points(size, size, "a picture of data.image_size")
     if experiment.validate_every and experiment.oxe is not None:
         raise UserError(
             "validate_every: nothing is held out of Open X-Embodiment mixtures, whose displacements are binned over "
@@ -264,7 +304,7 @@ def with_workspace(experiment: Experiment, run: Path, tokenizer: Tokenizer) -> E
     if not (experiment.fit_workspace and experiment.encoding.use_points):
         return experiment
     config = run / "config.json"
-    if config.exists():
+    if config.exists() and has_checkpoints(run):
         known = load_experiment(config).encoding
         box = {"workspace_low": known.workspace_low, "workspace_high": known.workspace_high}
         return dataclasses.replace(experiment, encoding=dataclasses.replace(experiment.encoding, **box))
@@ -299,25 +339,6 @@ def base_variables(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str,
     return {"params": params}
 
 
-def require_same_experiment(run: Path, experiment: Experiment) -> None:
-    """Raises CheckpointError where the run folder holds a run that would have learned something else."""
-    config = run / "config.json"
-    if not config.exists():
-        return
-    if fields := outcome_differences(load_experiment(config), experiment):
-        raise CheckpointError(
-            f"{config}: this run was started with another config ({', '.join(fields)} differ); "
-            "go on with the same one, or choose another --run"
-        )
-
-
-@contextlib.contextmanager
-def only_one_process(run: Path) -> Iterator[None]:
-    """Holds the run folder against another train.py; the system lets go of it however this one ends."""
-    with hold_folder(run, "is training this run") if jax.process_index() == 0 else contextlib.nullcontext():
-        yield
-
-
 def report_size(trainable: Any, frozen: Any, samples: int) -> None:
     """Prints what will be trained."""
     learn, rest = (sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (trainable, frozen))
@@ -336,12 +357,12 @@ def command_line(arguments: list[str]) -> None:
     start_processes()
     configure_jax()
 
-    def train_run(
+    def chosen(
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = experiment,
         run: Path = Path("runs") / Path(name).stem,
         wandb: str = "",
         profile: int = 0,
-    ) -> int:
+    ) -> tuple[Experiment, Path, str, int]:
         """Trains one experiment.
 
         Args:
@@ -350,10 +371,13 @@ def command_line(arguments: list[str]) -> None:
             wandb: the project of Weights & Biases to write metrics to as well.
             profile: how many steps to trace into the run folder's `profile`, from the third step on.
         """
-        with Watchdog(run / "processes").watching() as watchdog:
-            return main(experiment, run, watchdog, wandb, profile)
+        return experiment, run, wandb, profile
 
-    sys.exit(tyro.cli(train_run, args=rest, prog=f"train.py {name}", config=(tyro.conf.AvoidSubcommands,)))
+    options = {"args": rest, "prog": f"train.py {name}", "config": (tyro.conf.AvoidSubcommands,)}
+    experiment, run, wandb, profile = parse_options(chosen, **options)
+    with Watchdog(run / "processes").watching() as watchdog:
+        status = main(experiment, run, watchdog, wandb, profile)
+    sys.exit(status)
 
 
 def program() -> None:

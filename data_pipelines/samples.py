@@ -10,7 +10,7 @@ rotation which choice it is (`encoding.number_targets`), and is 0 elsewhere.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 
 import numpy as np
@@ -79,6 +79,20 @@ def make_sampler(
         }
 
     return sample
+
+
+def require_texts_fit(encoding: EncodingConfig, tokenizer: Tokenizer, instructions: Iterable[tuple[str, int]]) -> None:
+    """Raises UserError if an instruction's prompt and answer are longer than `max_text_length`.
+
+    instructions: each with the number of arms of its task. The poses are ordinary ones: where the length of numbers
+    varies, a sample may still be somewhat longer.
+    """
+    for text, arms in instructions:
+        pose = np.tile(np.array([0.2, 0.1, 0.9, 0, 1, 0, 0], np.float32), (arms, 1))
+        gripper, keypoint = np.ones(arms, np.float32), np.zeros((arms, 3), np.float32)
+        prompt = build_prompt(encoding, text, pose, gripper, keypoint)
+        answer = format_answer(np.asarray(encoding.codec.encode(pose, gripper)), encoding.style)
+        encode_text(tokenizer, prompt, answer, encoding.max_text_length)
 
 
 def make_validation_sampler(

@@ -6,10 +6,12 @@ from typing import Any
 
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
-from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.text import Tokenizer, check_words
+from data_pipelines.samples import require_texts_fit
+from dsvla_jax.data_config import DataConfig, OxeConfig
+from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.text import Tokenizer, check_words, unknown_words
 from dsvla_jax.errors import UserError
-from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.sim.tasks import TASKS, select_tasks
 
 
 def choose_tasks(data: DataConfig) -> tuple[str, ...]:
@@ -31,9 +33,15 @@ def open_demonstrations(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader
     if data.source == "simulator":
         generate_demonstrations(folder, tasks, data.episodes, workers=workers, **_simulator_settings(data))
         return EpisodeReader(folder, tasks=tasks, episodes=data.episodes)
-    reader = EpisodeReader(folder, tasks=tasks, episodes=data.episodes, fewer=True)
+    reader = _open_folder(data, tokenizer)
     if (present := len(EpisodeReader(folder, tasks=tasks))) > len(reader):
         print(f"{folder}: {len(reader)} of {present} demonstrations are used (data.episodes is {data.episodes} a task)")
+    return reader
+
+
+def _open_folder(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader:
+    folder = Path(data.folder)
+    reader = EpisodeReader(folder, tasks=choose_tasks(data), episodes=data.episodes, fewer=True)
     check_words(folder, reader.instructions, tokenizer, f"python -m data_pipelines.vocabulary {folder} OUT")
     return reader
 
@@ -60,6 +68,43 @@ def open_held_out(data: DataConfig, tokenizer: Tokenizer, episodes: int) -> Epis
     reader = EpisodeReader(folder, tasks=tasks, episodes=episodes, skip=data.episodes, fewer=True)
     check_words(folder, reader.instructions, tokenizer, f"python -m data_pipelines.vocabulary {folder} OUT")
     return reader
+
+
+def require_data_fits(
+    data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer, held_out: int = 0
+) -> tuple[int, int]:
+    """Height and width of the pictures of ``data``. Raises UserError where they, or the texts, do not fit the encoding.
+
+    Demonstrations of the simulator are judged by what they will be: nothing is made. held_out: as `open_held_out`'s
+    ``episodes``, 0 for none.
+    """
+    if data.source == "simulator":
+        picture, name = (data.image_size, data.image_size), "data.image_size"
+        tasks = [TASKS[task] for task in choose_tasks(data)]
+        texts = [(text, task.num_arms) for task in tasks for text in task.all_instructions()]
+        if unknown := unknown_words([text for text, _ in texts], tokenizer):
+            raise UserError(
+                f"tokenizer: it lacks {len(unknown)} words of the tasks' instructions ({', '.join(unknown[:5])}); "
+                "leave it empty for the words of the task suite"
+            )
+    else:
+        reader, name = _open_folder(data, tokenizer), data.folder
+        if held_out:
+            open_held_out(data, tokenizer, held_out)
+        height, width = reader.frame(0)["depth"].shape
+        picture = (height, width)
+        texts = [(text, min(reader.num_arms.values())) for text in reader.instructions]
+    encoding.require_points(*picture, f"a picture of {name}")
+    require_texts_fit(encoding, tokenizer, texts)
+    return picture
+
+
+def require_oxe_fits(oxe: OxeConfig, encoding: EncodingConfig, tokenizer: Tokenizer) -> tuple[int, int]:
+    """As `require_data_fits`, of Open X-Embodiment: with the shortest text, since instructions are not read yet."""
+    picture = (oxe.image_size, oxe.image_size)
+    encoding.require_points(*picture, "a picture of oxe.image_size")
+    require_texts_fit(encoding, tokenizer, [("", 1)])
+    return picture
 
 
 def _simulator_settings(data: DataConfig) -> dict[str, Any]:

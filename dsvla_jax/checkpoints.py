@@ -303,6 +303,12 @@ def _require_index(item: Path) -> None:
         raise CheckpointError(f"{item}: {ARRAY_INDEX} is missing, so its arrays could not be read")
 
 
+def has_checkpoints(run: Path) -> bool:
+    """Whether a run folder holds a checkpoint, be it a damaged one."""
+    folder = run / "checkpoints"
+    return bool(_steps(folder)) or (folder / "damaged").exists()
+
+
 def _steps(folder: Path) -> list[int]:
     """The steps that are in the folder under their final names."""
     return sorted(int(path.name) for path in folder.glob("*") if path.name.isdigit())

@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import errno
+import io
 import multiprocessing
 import os
 import signal
@@ -14,8 +15,10 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import jax
+import tyro
 
 from dsvla_jax.errors import UserError
 
@@ -41,6 +44,12 @@ def fail_with_message() -> Iterator[None]:
         where = "" if error.filename is None else f"{error.filename}: "
         fix = "choose another path, or mend this one (its name, permissions, free space)"
         print(f"error: {where}{error.strerror}; {fix}", file=sys.stderr)
+        sys.exit(1)
+    except jax.errors.JaxRuntimeError as error:
+        if not str(error).startswith("RESOURCE_EXHAUSTED"):
+            raise
+        message = str(error).splitlines()[0][:200]
+        print(f"error: out of memory: {message}; lower the batch size, or use more or larger devices", file=sys.stderr)
         sys.exit(1)
     except Exception as error:
         # array_record, tensorstore and other native libraries have their own errors for a full or read-only disk.
@@ -143,3 +152,24 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         for parameter, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1), (M_ARENA_MAX, 1)):
             mallopt(parameter, value)
+
+
+def parse_options(options: Any, **settings: Any) -> Any:
+    """`tyro.cli`, but for values that a config refuses: those end in the config's own message (UserError).
+
+    options: what tyro makes an object of; if a function, one that only returns what it is given. settings: as tyro's.
+    """
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed):
+            parsed = tyro.cli(options, **settings)
+    except SystemExit as end:
+        cause: BaseException | None = end
+        while cause is not None and not isinstance(cause, UserError):
+            cause = cause.__context__
+        if cause is not None:
+            raise cause from None
+        print(printed.getvalue(), end="", file=sys.stderr)
+        raise
+    print(printed.getvalue(), end="", file=sys.stderr)
+    return parsed

@@ -3,7 +3,11 @@
 import dataclasses
 from typing import Literal
 
-from dsvla_jax.errors import UserError
+from dsvla_jax.ranges import at_least, check_fields, more_than, require
+
+SHARE = at_least(0, at_most=1)
+# Noise in metres: the box that poses are counted in is 2 m wide.
+NOISE = at_least(0, at_most=10)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +42,22 @@ class DataConfig:
     """Relative strength of the brightness, contrast and colour variation; 0 turns it off."""
 
     def __post_init__(self) -> None:
-        _require(0 < self.crop <= 1, "crop", "more than 0, at most 1", self.crop)
+        check_fields(
+            self,
+            "data",
+            episodes=at_least(1),
+            image_size=at_least(1),
+            seed=at_least(0),
+            perturb=NOISE,
+            shift_world=NOISE,
+            crop=more_than(0, at_most=1),
+            state_jitter=NOISE,
+            keypoint_noise=NOISE,
+            keypoint_noise_probability=SHARE,
+            colour_variation=SHARE,
+        )
+        require_folder("data.folder", self.folder)
+        require(bool(_names(self.tasks)), "data.tasks", "names of tasks", self.tasks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,13 +96,19 @@ class OxeConfig:
     """A folder for indices and statistics; empty: beside the data, or the user's cache where that cannot be written."""
 
     def __post_init__(self) -> None:
-        _require(self.horizon >= 0, "horizon", "seconds ahead, or 0 for the next key frame", self.horizon)
-        _require(0 < self.crop <= 1, "crop", "more than 0, at most 1", self.crop)
-        _require(self.image_size > 0, "image_size", "at least 1", self.image_size)
-        _require(self.window > 0, "window", "at least 1", self.window)
-        _require(self.streams > 0, "streams", "at least 1", self.streams)
-        choices = ("leave_out", "keep", "refuse")
-        _require(self.unlabelled in choices, "unlabelled", "leave_out, keep or refuse", repr(self.unlabelled))
+        check_fields(
+            self,
+            "oxe",
+            horizon=at_least(0),
+            image_size=at_least(1),
+            crop=more_than(0, at_most=1),
+            colour_variation=SHARE,
+            window=at_least(1),
+            streams=at_least(1),
+        )
+        require_folder("oxe.folder", self.folder)
+        require(bool(_names(self.mixture)), "oxe.mixture", "a named mixture or names of datasets", self.mixture)
+        require(bool(self.split), "oxe.split", "the name of a split, such as train", repr(self.split))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +129,10 @@ class LearnedFrom:
     """The camera's name; empty if the data do not say."""
 
 
-def _require(holds: bool, field: str, expected: str, got: float | str) -> None:
-    if not holds:
-        raise UserError(f"{field}: expected {expected}, got {got}")
+def require_folder(option: str, folder: str) -> None:
+    """Raises UserError for an empty name: it would mean the folder that the program is started in."""
+    require(bool(folder.strip()), option, "the path of a folder", repr(folder))
+
+
+def _names(words: tuple[str, ...]) -> list[str]:
+    return [name for word in words for name in word.split(",") if name.strip()]

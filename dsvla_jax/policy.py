@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import cattrs
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
@@ -28,6 +28,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
 from dsvla_jax.model.layers_apart import take_apart
 from dsvla_jax.model.partition import shardings
+from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import Action, Array, ModelInputs, Observation
@@ -49,6 +50,9 @@ class PolicyConfig:
         """Whether prompts state a keypoint, because those of training did."""
         seen = self.learned_from is None or self.learned_from.keypoints != "none"
         return self.encoding.use_keypoints and seen
+
+    def __post_init__(self) -> None:
+        require_same_sizes(self.encoding, self.model)
 
 
 # Batches are filled up to one of these sizes, so that any size runs without compiling again; beyond, to a multiple of
@@ -184,11 +188,9 @@ def load_policy_config(run: Path) -> PolicyConfig:
             f"{run}: no run here (policy.json is missing); train one: python train.py CONFIG --run {run}"
         )
     try:
-        return cattrs.Converter(forbid_extra_keys=True).structure(json.loads(file.read_text()), PolicyConfig)
-    except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
-        raise CheckpointError(
-            f"{file}: not a policy of this version of dsvla_jax ({error}); train the run again"
-        ) from error
+        return read_config(file, PolicyConfig, "a policy")
+    except UserError as error:
+        raise CheckpointError(f"{error}; train the run again") from error
 
 
 def load(

@@ -318,10 +318,19 @@ def test_initialize_embeds_numbers():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: VisionConfig(image_size=30, patch_size=8), "not a multiple of patch_size"),
-        (lambda: LanguageConfig(heads=32, kv_heads=5), "kv_heads 5"),
-        (lambda: LoraConfig(targets=("query",)), "unknown targets"),
-        (lambda: dataclasses.replace(CONFIG, point_width=31), "3D tokenizer's width to 32"),
+        (
+            lambda: VisionConfig(image_size=30, patch_size=8),
+            "vision.image_size: expected a multiple of patch_size 8, got 30",
+        ),
+        (
+            lambda: LanguageConfig(heads=32, kv_heads=5),
+            "kv_heads: expected a divisor of heads 32, got 5",
+        ),
+        (
+            lambda: LoraConfig(targets=("query",)),
+            "model.lora.targets: expected some of q, .*, got 'query'",
+        ),
+        (lambda: dataclasses.replace(CONFIG, point_width=31), "model.point_width: expected the vision width 32"),
     ],
 )
 def test_impossible_configs_say_why(make, message):

@@ -286,7 +286,7 @@ def test_encode_observation_takes_other_image_sizes_and_no_points():
     )
     assert image["point_tokens"].shape == (2, 0, 96)
     assert image["point_patches"].shape == (2, 0)
-    with pytest.raises(ValueError, match=r"16 x 16 depth map with stride 4 has 16 points"):
+    with pytest.raises(ValueError, match=r"at most the 16 points of a depth map of 16 x 16 pixels with .*stride 4"):
         encode_observation(observation(16), dataclasses.replace(CONFIG, stride=4))
     with pytest.raises(ValueError, match=r"expected a batch of uint8 images .* float32"):
         encode_observation(dataclasses.replace(flat, rgb=jnp.zeros((2, 32, 32, 3))), CONFIG)

@@ -221,23 +221,23 @@ def test_narrowing_the_frozen_base_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    ("config", "devices", "expected"),
+    ("sizes", "expected"),
     [
-        (MeshConfig(), 8, (8, 1, 1)),
-        (MeshConfig(2, -1, 2), 8, (2, 2, 2)),
-        (MeshConfig(1, 8, 1), 8, (1, 8, 1)),
-        (MeshConfig(3, -1, 1), 8, "data=3, fsdp=-1, tensor=1 cannot be laid over 8 devices"),
-        (MeshConfig(2, 2, 1), 8, "product of 8"),
-        (MeshConfig(-1, -1, 1), 8, "-1 .* for one axis at most"),
-        (MeshConfig(0, -1, 1), 8, "positive sizes"),
+        ((-1, 1, 1), (8, 1, 1)),
+        ((2, -1, 2), (2, 2, 2)),
+        ((1, 8, 1), (1, 8, 1)),
+        ((3, -1, 1), "data=3, fsdp=-1, tensor=1 cannot be laid over 8 devices"),
+        ((2, 2, 1), "product of 8"),
+        ((-1, -1, 1), "-1 .* for one axis at most"),
+        ((0, -1, 1), "positive sizes"),
     ],
 )
-def test_sizes_of_a_mesh(config, devices, expected):
+def test_sizes_of_a_mesh(sizes, expected):
     if isinstance(expected, tuple):
-        assert config.shape(devices) == expected
+        assert MeshConfig(*sizes).shape(8) == expected
     else:
         with pytest.raises(UserError, match=expected):
-            config.shape(devices)
+            MeshConfig(*sizes).shape(8)
 
 
 @pytest.mark.parametrize(

@@ -298,14 +298,23 @@ def test_padding_and_batch_mates_never_change_an_answer(variables):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: dataclasses.replace(CONFIG, fusion="adaptor"), "expected 'prefix' or 'adapter', got 'adaptor'"),
-        (lambda: dataclasses.replace(CONFIG, projector="mlp"), "belongs to fusion='prefix'"),
-        (lambda: VisualPromptConfig(width=33), r"width 33 must be a multiple of 2 \* heads = 16"),
-        (lambda: VisualPromptConfig(queries=-1), "queries must not be negative, got -1"),
-        (lambda: VisualPromptConfig(layers=0), "layers must be positive, got 0"),
+        (
+            lambda: dataclasses.replace(CONFIG, fusion="adaptor"),
+            "expected one of prefix, adapter, got 'adaptor'",
+        ),
+        (
+            lambda: dataclasses.replace(CONFIG, projector="mlp"),
+            "projector: expected 'linear' with fusion 'adapter'",
+        ),
+        (
+            lambda: VisualPromptConfig(width=33),
+            r"width: expected a multiple of 2 \* heads = 16, got 33",
+        ),
+        (lambda: VisualPromptConfig(queries=-1), "model.visual_prompt.queries: expected at least 0, got -1"),
+        (lambda: VisualPromptConfig(layers=0), "model.visual_prompt.layers: expected at least 1, got 0"),
         (
             lambda: dataclasses.replace(CONFIG, visual_prompt=VisualPromptConfig(prompted_layers=4)),
-            "prompted_layers 4 must be from 1 to the language model's 3 layers",
+            "prompted_layers: expected at most the language model's 3 layers, got 4",
         ),
     ],
 )

@@ -239,7 +239,7 @@ def test_summaries_tell_layers_once():
         ({"attention_multiplier": 0.0156}, "attention_multiplier: only 1.0 is supported"),
         ({"quantization_config": {"bits": 4}}, "quantization_config: only {} is supported"),
         ({"auto_map": {"AutoModelForCausalLM": "own.Own"}}, "auto_map: AutoModelForCausalLM: .* code of its own"),
-        ({"num_key_value_heads": 3}, "config.json: language: heads 2 is not a multiple of kv_heads 3"),
+        ({"num_key_value_heads": 3}, "config.json: model.language.kv_heads: expected a divisor of heads 2, got 3"),
         ({"vocab_size": 22}, r"00001-of-.*: model.embed_tokens.weight: expected shape \(22, 16\) .* found \(21, 16\)"),
         ({"num_hidden_layers": 1}, r"no place in this architecture for: model.layers.1.input_layernorm.weight, "),
         ({"num_hidden_layers": 3}, r"missing: model.layers.2.input_layernorm.weight, "),
@@ -406,7 +406,7 @@ def test_a_file_cut_anywhere_is_an_error(sharded):
 def test_vision_sources_that_do_not_fit(tmp_path):
     with pytest.raises(WeightsError, match=r"expected model_type 'clip_vision_model' .* found 'llama'"):
         read_vision(GOLDEN / "llama_sharded")
-    with pytest.raises(WeightsError, match=r"image size 10 .* image_size 10 is not a multiple of patch_size 3"):
+    with pytest.raises(WeightsError, match=r"image size 10 .* image_size: expected a multiple of patch_size 3, got 10"):
         read_vision(GOLDEN / "clip", 10)
     folder = write_checkpoint(tmp_path / "source", CASES["odd_grid"]["config"], case_tensors("plain"))
     with pytest.raises(WeightsError, match=r"visual_projection.weight is missing"):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from dsvla_jax.ranges import Range, at_least, check_fields, require, require_box
 from dsvla_jax.types import Action, Array
 
 QUATERNION_STEP = 0.01
@@ -35,8 +36,10 @@ class PoseCodec:
     bins: int = 200
 
     def __post_init__(self):
-        if self.bins < 1 or any(low >= high for low, high in zip(self.low, self.high, strict=True)):
-            raise ValueError(f"PoseCodec: expected low < high on each axis and bins >= 1, got {self}")
+        metres = Range(-1000, 1000)
+        check_fields(self, "encoding.codec", low=metres, high=metres, bins=at_least(1))
+        require_box("encoding.codec.low", self.low, "high", self.high)
+        require(bool((self.step > 1e-6).all()), "encoding.codec.bins", "steps of more than 1e-6 metres", self.step)
 
     @property
     def step(self) -> np.ndarray:

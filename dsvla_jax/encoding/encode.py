@@ -13,8 +13,10 @@ from dsvla_jax.encoding.farthest_point import farthest_point_sample
 from dsvla_jax.encoding.grammar import tokenize_answer
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig, tokenize_points
-from dsvla_jax.encoding.prompts import Style, format_prompt
+from dsvla_jax.encoding.prompts import POSITION_SLOT, Style, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.errors import UserError
+from dsvla_jax.ranges import FINITE, at_least, check_fields, require, require_box
 from dsvla_jax.types import Array, Observation
 
 # The normalisation CLIP was trained with (https://github.com/openai/CLIP).
@@ -54,8 +56,51 @@ class EncodingConfig:
     use_points: bool = True
 
     def __post_init__(self):
-        if self.image_size % self.patch_size:
-            raise ValueError(f"image_size: expected a multiple of patch_size {self.patch_size}, got {self.image_size}")
+        check_fields(
+            self,
+            "encoding",
+            image_size=at_least(1),
+            patch_size=at_least(1),
+            stride=at_least(1),
+            workspace_low=FINITE,
+            workspace_high=FINITE,
+            max_text_length=at_least(1),
+        )
+        require_box("encoding.workspace_low", self.workspace_low, "workspace_high", self.workspace_high)
+        patches = f"a multiple of patch_size {self.patch_size}"
+        require(self.image_size % self.patch_size == 0, "encoding.image_size", patches, self.image_size)
+        if self.use_points and self.alignment == "index_order":
+            require(
+                self.num_point_tokens <= self.grid**2,
+                "encoding.points.group_sizes",
+                f"at most {self.grid**2} tokens at the end with alignment index_order, one a patch",
+                self.num_point_tokens,
+            )
+        self._require_writable_positions()
+
+    def _require_writable_positions(self) -> None:
+        """Raises UserError if the codec counts a position by an integer that no answer may hold."""
+        low, high = np.array(self.codec.low), np.array(self.codec.high)
+        counts = np.array([low, high]) * self.codec.bins / (high - low)
+        lowest, highest = round(counts.min()), round(counts.max())
+        require(
+            POSITION_SLOT.low <= lowest and highest <= POSITION_SLOT.high,
+            "encoding.codec.bins",
+            f"positions that count from {POSITION_SLOT.low} to {POSITION_SLOT.high}, as an answer writes them",
+            f"{lowest} to {highest}",
+            f"use fewer bins than {self.codec.bins}, or a larger box than {self.codec.low} to {self.codec.high}",
+        )
+
+    def require_points(self, height: int, width: int, picture: str = "a depth map") -> None:
+        """Raises UserError if a depth map has fewer points than the 3D tokenizer takes. picture: what to call it."""
+        count = -(-height // self.stride) * -(-width // self.stride)
+        require(
+            not self.use_points or count >= self.points.num_points,
+            "encoding.points.num_points",
+            f"at most the {count} points of {picture} of {height} x {width} pixels with encoding.stride {self.stride}",
+            self.points.num_points,
+            "lower num_points or stride, or use larger pictures",
+        )
 
     @property
     def grid(self) -> int:
@@ -91,17 +136,13 @@ def cloud_tokens(observation: Observation, config: EncodingConfig) -> tuple[Arra
     """The 3D tokens of a batch: tokens float32 (B, G, D3), their centres (B, G, 3), metres, world frame, and the image
     patches int32 (B, G) that they are aligned with."""
     height, width = observation.depth.shape[1:]
+    config.require_points(height, width)
     cloud = jax.vmap(
         lambda depth, camera: cloud_from_depth(
             depth, camera, config.workspace_low, config.workspace_high, config.stride
         )
     )
     points, valid = cloud(observation.depth, observation.camera)
-    if points.shape[1] < config.points.num_points:
-        raise ValueError(
-            f"a {height} x {width} depth map with stride {config.stride} has {points.shape[1]} points, fewer than "
-            f"num_points {config.points.num_points}; lower one of stride and num_points or use a larger image"
-        )
     chosen = farthest_point_sample(points, valid, config.points.num_points)
     points = jnp.take_along_axis(points, chosen[..., None], axis=1)
     tokens, centers = jax.vmap(lambda one: tokenize_points(one, config.points))(points)
@@ -165,7 +206,7 @@ def encode_text(
     tokens = [tokenizer.bos_id, *asked, *answered]
     length = len(tokens)
     if length > max_length:
-        raise ValueError(
+        raise UserError(
             f"text: {length} tokens are more than max_text_length {max_length}; raise it, or shorten {prompt!r}"
         )
     padded = np.full(max_length, tokenizer.pad_id, np.int32)

@@ -13,6 +13,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from dsvla_jax.encoding.neighbours import k_nearest_neighbours
+from dsvla_jax.errors import UserError
+from dsvla_jax.ranges import Range, at_least, check_fields, more_than
 from dsvla_jax.types import Array
 
 
@@ -43,17 +45,35 @@ class PointTokenizerConfig:
     token_rms: float = 1.0
 
     def __post_init__(self):
+        check_fields(
+            self,
+            "encoding.points",
+            num_points=at_least(1),
+            group_sizes=at_least(1),
+            neighbours=at_least(1),
+            width=at_least(1),
+            alpha=more_than(0, at_most=1e6),
+            # Sines are exact for angles of up to 1e4 (`_sine`).
+            beta=more_than(0, at_most=1e4),
+            center=Range(-1000, 1000),
+            half_extent=at_least(1e-3, at_most=1000),
+            token_rms=more_than(0, at_most=1000),
+        )
         levels = (self.num_points, *self.group_sizes)
         if len(levels) < 2 or any(after > before for before, after in itertools.pairwise(levels)):
-            raise ValueError(f"group_sizes: expected at most num_points ({self.num_points}), falling, got {levels[1:]}")
+            raise UserError(
+                f"encoding.points.group_sizes: expected one or more, falling, at most num_points {self.num_points}; "
+                f"got {self.group_sizes}"
+            )
         if self.width % 2 ** len(self.group_sizes) or self.base_width < 6:
-            raise ValueError(
-                f"width: expected a multiple of 2^stages ({2 ** len(self.group_sizes)}) that leaves 6 channels or more "
-                f"for the first features, got {self.width}"
+            raise UserError(
+                f"encoding.points.width: expected a multiple of 2^stages ({2 ** len(self.group_sizes)}) that leaves 6 "
+                f"channels or more for the first features, got {self.width}"
             )
         if self.neighbours > levels[-2]:
-            raise ValueError(
-                f"neighbours: expected at most {levels[-2]}, the last stage's points, got {self.neighbours}"
+            raise UserError(
+                f"encoding.points.neighbours: expected at most {levels[-2]}, the last stage's points, got "
+                f"{self.neighbours}"
             )
 
     @property

@@ -5,12 +5,18 @@ from typing import Literal
 
 import jax.numpy as jnp
 
+from dsvla_jax.ranges import at_least, check_fields, more_than, require
+
 LORA_TARGETS = ("q", "k", "v", "o", "gate", "up", "down")
 
+COUNT = at_least(1)
+EPSILON = more_than(0, at_most=1)
+ROPE_THETA = at_least(1)
 
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
+
+def _require_known(field: str, chosen: tuple[str, ...], known: tuple[str, ...]) -> None:
+    unknown = sorted(set(chosen) - set(known))
+    require(not unknown, field, f"some of {', '.join(known)}", ", ".join(map(repr, unknown)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,13 +37,26 @@ class VisionConfig:
     embed_width: int | None = None
 
     def __post_init__(self):
-        _require(
+        check_fields(
+            self,
+            "model.vision",
+            image_size=COUNT,
+            patch_size=COUNT,
+            width=COUNT,
+            layers=COUNT,
+            heads=COUNT,
+            mlp_ratio=more_than(0),
+            norm_eps=EPSILON,
+            embed_width=COUNT,
+        )
+        require(
             self.image_size % self.patch_size == 0,
-            f"vision: image_size {self.image_size} is not a multiple of patch_size {self.patch_size}",
+            "model.vision.image_size",
+            f"a multiple of patch_size {self.patch_size}",
+            self.image_size,
         )
-        _require(
-            self.width % self.heads == 0, f"vision: width {self.width} is not a multiple of its {self.heads} heads"
-        )
+        require(self.width % self.heads == 0, "model.vision.width", f"a multiple of its {self.heads} heads", self.width)
+        require(self.ffn >= 1, "model.vision.mlp_ratio", f"at least 1 / width {self.width}", self.mlp_ratio)
 
     @property
     def grid(self) -> int:
@@ -68,14 +87,19 @@ class RopeScaling:
     original_context: int = 8192
 
     def __post_init__(self):
-        _require(
-            self.factor > 0 and self.original_context > 0,
-            f"rope_scaling: factor {self.factor} and original_context {self.original_context} must be positive",
+        check_fields(
+            self,
+            "model.language.rope_scaling",
+            factor=more_than(0),
+            low_frequency_factor=at_least(0),
+            high_frequency_factor=more_than(0),
+            original_context=COUNT,
         )
-        _require(
+        require(
             self.high_frequency_factor > self.low_frequency_factor,
-            f"rope_scaling: high_frequency_factor {self.high_frequency_factor} must be larger than "
-            f"low_frequency_factor {self.low_frequency_factor}",
+            "model.language.rope_scaling.high_frequency_factor",
+            f"more than low_frequency_factor {self.low_frequency_factor}",
+            self.high_frequency_factor,
         )
 
 
@@ -101,22 +125,40 @@ class LanguageConfig:
     biases: tuple[str, ...] = ()
 
     def __post_init__(self):
+        check_fields(
+            self,
+            "model.language",
+            vocab_size=COUNT,
+            width=COUNT,
+            layers=COUNT,
+            heads=COUNT,
+            kv_heads=COUNT,
+            ffn=COUNT,
+            rope_theta=ROPE_THETA,
+            norm_eps=EPSILON,
+            explicit_head_dim=COUNT,
+        )
+        # A rotation turns pairs of numbers.
         if self.explicit_head_dim is None:
-            _require(
+            require(
                 self.width % (2 * self.heads) == 0,
-                f"language: width {self.width} must be a multiple of 2 * heads = {2 * self.heads} (rotary halves), "
-                "unless explicit_head_dim is given",
+                "model.language.width",
+                f"a multiple of 2 * heads = {2 * self.heads}, or explicit_head_dim",
+                self.width,
             )
         else:
-            _require(
-                self.explicit_head_dim > 0 and self.explicit_head_dim % 2 == 0,
-                f"language: explicit_head_dim must be positive and even (rotary halves), got {self.explicit_head_dim}",
+            require(
+                self.explicit_head_dim % 2 == 0,
+                "model.language.explicit_head_dim",
+                "an even number",
+                self.explicit_head_dim,
             )
-        unknown = sorted(set(self.biases) - set(LORA_TARGETS))
-        _require(not unknown, f"language: unknown biases {unknown}; choose from {list(LORA_TARGETS)}")
-        _require(
+        _require_known("model.language.biases", self.biases, LORA_TARGETS)
+        require(
             self.heads % self.kv_heads == 0,
-            f"language: heads {self.heads} is not a multiple of kv_heads {self.kv_heads}",
+            "model.language.kv_heads",
+            f"a divisor of heads {self.heads}",
+            self.kv_heads,
         )
 
     @property
@@ -144,14 +186,23 @@ class VisualPromptConfig:
     prompted_layers: int | None = None
 
     def __post_init__(self):
-        _require(
-            self.width % (2 * self.heads) == 0,
-            f"visual_prompt: width {self.width} must be a multiple of 2 * heads = {2 * self.heads} (rotary halves)",
+        check_fields(
+            self,
+            "model.visual_prompt",
+            width=COUNT,
+            layers=COUNT,
+            heads=COUNT,
+            ffn=COUNT,
+            rope_theta=ROPE_THETA,
+            norm_eps=EPSILON,
+            queries=at_least(0),
+            prompted_layers=COUNT,
         )
-        _require(self.layers > 0, f"visual_prompt: layers must be positive, got {self.layers}")
-        _require(
-            self.queries >= 0,
-            f"visual_prompt: queries must not be negative, got {self.queries}; 0 makes every visual token a prompt",
+        require(
+            self.width % (2 * self.heads) == 0,
+            "model.visual_prompt.width",
+            f"a multiple of 2 * heads = {2 * self.heads}",
+            self.width,
         )
 
 
@@ -172,13 +223,13 @@ class LoraConfig:
     init: Literal["kaiming", "normal"] = "kaiming"
 
     def __post_init__(self):
-        _require(self.rank > 0, f"lora: rank must be positive, got {self.rank}; use lora=None for no adapters")
+        check_fields(self, "model.lora", rank=COUNT, alpha=more_than(0))
         for name, chosen, known in (
             ("targets", self.targets, LORA_TARGETS),
             ("towers", self.towers, ("vision", "language")),
         ):
-            unknown = sorted(set(chosen) - set(known))
-            _require(not unknown, f"lora: unknown {name} {unknown}; choose from {list(known)}")
+            require(bool(chosen), f"model.lora.{name}", f"some of {', '.join(known)}", "none")
+            _require_known(f"model.lora.{name}", chosen, known)
 
     @property
     def scale(self) -> float:
@@ -223,22 +274,25 @@ class ModelConfig:
     scan_unroll: int = 1
 
     def __post_init__(self):
-        _require(
+        check_fields(self, "model", point_width=COUNT, scan_unroll=COUNT)
+        require(
             self.point_width in (None, self.vision.width),
-            f"point_width {self.point_width} differs from the vision width {self.vision.width}: 3D tokens enter the "
-            f"vision tower unprojected, so set the 3D tokenizer's width to {self.vision.width}",
+            "model.point_width",
+            f"the vision width {self.vision.width}, because 3D tokens enter the vision tower unprojected",
+            self.point_width,
         )
-        _require(self.fusion in ("prefix", "adapter"), f"fusion: expected 'prefix' or 'adapter', got {self.fusion!r}")
         if self.fusion == "adapter":
-            _require(
+            require(
                 self.projector == "linear",
-                f"projector {self.projector!r} belongs to fusion='prefix'; with 'adapter' the projection is "
-                "visual_prompt, so leave projector at 'linear'",
+                "model.projector",
+                "'linear' with fusion 'adapter', whose projection is visual_prompt",
+                repr(self.projector),
             )
-            _require(
-                0 < self.prompted_layers <= self.language.layers,
-                f"visual_prompt: prompted_layers {self.prompted_layers} must be from 1 to the language model's "
-                f"{self.language.layers} layers",
+            require(
+                self.prompted_layers <= self.language.layers,
+                "model.visual_prompt.prompted_layers",
+                f"at most the language model's {self.language.layers} layers",
+                self.prompted_layers,
             )
 
     @property

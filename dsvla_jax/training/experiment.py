@@ -5,12 +5,13 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-import cattrs
-
+from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.same_sizes import require_same_sizes
+from dsvla_jax.ranges import at_least, check_fields, more_than, require
 from dsvla_jax.training.sharding import MeshConfig
 
 
@@ -19,12 +20,28 @@ class OptimizerConfig:
     """AdamW with linear warm-up and a cosine to `final_fraction` of the peak."""
 
     learning_rate: float = 1e-3
+    """Of the peak."""
     warmup_steps: int = 50
+    """Steps of linear warm-up, but at most a fifth of the run."""
     final_fraction: float = 0.0
     weight_decay: float = 0.05
     beta1: float = 0.9
     beta2: float = 0.95
     gradient_clip: float = 1.0
+    """Largest norm of the gradient; inf for no limit."""
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            "optimizer",
+            learning_rate=more_than(0),
+            warmup_steps=at_least(0),
+            final_fraction=at_least(0, at_most=1),
+            weight_decay=at_least(0),
+            beta1=at_least(0, below=1),
+            beta2=at_least(0, below=1),
+            gradient_clip=more_than(0, infinite=True),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +53,9 @@ class ValidationConfig:
     batches: int = 8
     """At most so many, always the same ones; fewer where that is all of the demonstrations."""
 
+    def __post_init__(self) -> None:
+        check_fields(self, "validation", episodes=at_least(1), batches=at_least(1))
+
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationConfig:
@@ -45,6 +65,9 @@ class EvaluationConfig:
     """Unseen episodes a task, for eval.py."""
     episodes_while_training: int = 10
     """Unseen episodes a task, every `evaluate_every` steps."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "evaluation", episodes=at_least(1), episodes_while_training=at_least(1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,11 +103,13 @@ class Experiment:
     """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0
     log_every: int = 20
+    """Steps after which the numbers of a step are written, and at the end; 0 for the end alone."""
     validate_every: int = 0
     """Steps after which answers are compared with held-out demonstrations, and at the end; 0 for never."""
     evaluate_every: int = 0
     """Steps after which the policy acts in episodes of the training tasks, and at the end; 0 for never."""
     checkpoint_every: int = 250
+    """Steps after which a checkpoint is written, and at the end; 0 for the end alone."""
     keep_checkpoints: int = 2
     """The newest checkpoints that stay, besides the best one where steps are validated or evaluated."""
     max_skipped_steps: int = 10
@@ -96,17 +121,31 @@ class Experiment:
         return self.data.keypoints if self.encoding.use_keypoints else "oracle"
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise UserError(f"steps: expected at least 1, got {self.steps}")
-        if self.regime != "full" and self.model.lora is None:
-            raise UserError(
-                f"regime: {self.regime!r} needs adapters, but model.lora is None; give the config a LoraConfig"
-            )
-        if self.regime == "full" and self.model.base_dtype != "same":
-            raise UserError(
-                f"model.base_dtype: {self.model.base_dtype!r} is for frozen weights, but regime 'full' trains all; "
-                "use regime 'lora', or base_dtype 'same'"
-            )
+        check_fields(
+            self,
+            "",
+            steps=at_least(1),
+            batch_size=at_least(1),
+            gradient_accumulation=at_least(1),
+            soft_target_sigma=at_least(0),
+            seed=at_least(0),
+            log_every=at_least(0),
+            validate_every=at_least(0),
+            evaluate_every=at_least(0),
+            checkpoint_every=at_least(0),
+            keep_checkpoints=at_least(1),
+            max_skipped_steps=at_least(0),
+        )
+        require_same_sizes(self.encoding, self.model)
+        adapters = self.regime == "full" or self.model.lora is not None
+        require(adapters, "regime", "'full' without adapters", repr(self.regime), "give the config a model.lora")
+        require(
+            self.regime != "full" or self.model.base_dtype == "same",
+            "model.base_dtype",
+            "'same' with regime 'full', which trains all weights",
+            repr(self.model.base_dtype),
+            "use regime 'lora' for frozen weights",
+        )
 
 
 # What may change when a run goes on: none of it changes what the run learns.
@@ -138,9 +177,6 @@ def _differences(one: Any, other: Any) -> list[str]:
     return names
 
 
-_converter = cattrs.Converter(forbid_extra_keys=True)
-
-
 def save_experiment(path: Path, experiment: Experiment) -> None:
     """Writes the experiment as JSON: whole, or not at all."""
     partial = path.with_suffix(".partial")
@@ -150,11 +186,7 @@ def save_experiment(path: Path, experiment: Experiment) -> None:
 
 def load_experiment(path: Path) -> Experiment:
     """Reads what `save_experiment` wrote. Raises UserError naming the file where it is not an experiment."""
-    try:
-        return _converter.structure(json.loads(path.read_text()), Experiment)
-    except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
-        details = "; ".join(cattrs.transform_error(error)) if isinstance(error, cattrs.BaseValidationError) else error
-        raise UserError(f"{path}: not an experiment of this version: {details}") from error
+    return read_config(path, Experiment, "an experiment")
 
 
 def require_simulated(experiment: Experiment, run: Path) -> None:

@@ -44,7 +44,12 @@ class Check:
 
     def is_due(self, step: int, last: int) -> bool:
         """Whether after this step."""
-        return self.every > 0 and (step % self.every == 0 or step == last)
+        return self.every > 0 and (is_due(step, self.every) or step == last)
+
+
+def is_due(step: int, every: int) -> bool:
+    """Whether something that is done every so many steps, 0 for never, is done after this one."""
+    return every > 0 and step % every == 0
 
 
 def train(
@@ -89,7 +94,7 @@ def train(
             else:
                 clock.count(experiment.batch_size, int(batch["text_mask"].sum()) * jax.process_count())
             figures: dict[str, float] = {}
-            if done % experiment.log_every == 0 or done == experiment.steps:
+            if is_due(done, experiment.log_every) or done == experiment.steps:
                 numbers = {name: float(value) for name, value in values.items()}
                 figures = {**numbers, **clock.read(), **memory()}
                 bar.set_postfix_str(f"loss {numbers['loss']:.3f}, bins within one {numbers['bin_within_one']:.2f}")
@@ -106,7 +111,7 @@ def train(
                 metrics.write(done, figures)
             stop, score = request.after(done), score_of(figures)
             last = done == experiment.steps or stop is not None
-            if done % experiment.checkpoint_every == 0 or last or score is not None:
+            if is_due(done, experiment.checkpoint_every) or last or score is not None:
                 skipped.settle()
                 metrics.sync()
                 with clock.paused():

@@ -85,11 +85,18 @@ def _step_of(line: str) -> float:
         return math.inf
 
 
-def _start_wandb(run: Path, project: str, config: Mapping[str, Any]) -> Any:
+def require_wandb() -> None:
+    """Raises UserError where the package of Weights & Biases is not installed."""
     try:
-        import wandb  # pyright: ignore[reportMissingImports]
+        import wandb  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise UserError("--wandb: the package is not installed; install it with: pip install wandb") from error
+
+
+def _start_wandb(run: Path, project: str, config: Mapping[str, Any]) -> Any:
+    require_wandb()
+    import wandb  # pyright: ignore[reportMissingImports]
+
     name = run / "wandb_id.txt"
     if not name.exists():
         name.write_text(secrets.token_hex(4))

@@ -77,15 +77,15 @@ def plan_training(experiment: Experiment, where: Slice, examples: int) -> Plan:
     mesh = make_mesh(experiment.mesh, where.devices)
     experiment = dataclasses.replace(experiment, batch_size=examples * len(where.devices))
     batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
-    state, frozen, optimizer = _abstract_state(experiment, mesh)
+    state, frozen, optimizer = abstract_state(experiment, mesh)
     numbers = number_rows(planning_tokenizer(experiment), experiment.encoding.style)
     step = make_train_step(experiment, VLA(experiment.model), optimizer, numbers.targets(experiment.soft_target_sigma))
-    arguments = {"state": state, "frozen base": frozen, "batch": _abstract_batch(experiment, mesh)}
+    arguments = {"state": state, "frozen base": frozen, "batch": abstract_batch(experiment, mesh)}
     held = {
-        "frozen base": _bytes(frozen),
-        "trainable": _bytes(state.trainable),
-        "optimizer": _bytes(state.optimizer),
-        "batch": _bytes(arguments["batch"]),
+        "frozen base": bytes_on_a_device(frozen),
+        "trainable": bytes_on_a_device(state.trainable),
+        "optimizer": bytes_on_a_device(state.optimizer),
+        "batch": bytes_on_a_device(arguments["batch"]),
     }
     counted = sum(training_flops(experiment).values()) * examples
     lowered = jit_train_step(step, state, mesh).lower(*arguments.values())
@@ -97,10 +97,10 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
     mesh = make_mesh(experiment.mesh, where.devices)
     experiment = dataclasses.replace(experiment, batch_size=examples * len(where.devices))
     batch_part(mesh, experiment.batch_size)
-    state, frozen, _ = _abstract_state(experiment, mesh)
+    state, frozen, _ = abstract_state(experiment, mesh)
     grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
     names = ("rgb", "depth", "intrinsics", "world_from_camera", "text_tokens", "text_mask")
-    batch = {name: leaf for name, leaf in _abstract_batch(experiment, mesh).items() if name in names}
+    batch = {name: leaf for name, leaf in abstract_batch(experiment, mesh).items() if name in names}
 
     def decode(trainable: Any, frozen: Any, batch: Any) -> Any:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
@@ -108,7 +108,11 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
             inputs = ModelInputs(**picture, text_tokens=batch["text_tokens"], text_mask=batch["text_mask"])
             return decode_actions(VLA(experiment.model), join_variables(trainable, frozen), inputs, grammar)
 
-    held = {"frozen base": _bytes(frozen), "trainable": _bytes(state.trainable), "batch": _bytes(batch)}
+    held = {
+        "frozen base": bytes_on_a_device(frozen),
+        "trainable": bytes_on_a_device(state.trainable),
+        "batch": bytes_on_a_device(batch),
+    }
     counted = sum(prefill_flops(experiment).values()) * examples
     lowered = jax.jit(decode).lower(state.trainable, frozen, batch)
     return _plan("decoding", lowered, where, mesh, examples, held, counted)
@@ -116,8 +120,8 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
 
 def held_bytes(experiment: Experiment, mesh: Mesh) -> int:
     """Bytes a chip of parameters and optimizer: what must fit before anything is computed."""
-    state, frozen, _ = _abstract_state(experiment, mesh)
-    return _bytes((state, frozen))
+    state, frozen, _ = abstract_state(experiment, mesh)
+    return bytes_on_a_device((state, frozen))
 
 
 def peak_bytes(compiled: Any) -> int:
@@ -184,19 +188,24 @@ def _needed(message: str) -> int | None:
     return int(float(found[1]) * 2 ** {"K": 10, "M": 20, "G": 30}[found[2]]) if found else None
 
 
-def _abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[Any, Any, Any]:
+def abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[Any, Any, Any]:
     """State and frozen variables as shapes with shardings, and the optimizer."""
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
     return *_placed((state, frozen), shardings((state, frozen), mesh)), optimizer
 
 
-def _abstract_batch(experiment: Experiment, mesh: Mesh) -> dict[str, Any]:
-    """The arrays of a batch (see `data_pipelines.samples`) as shapes with shardings."""
-    size, text = experiment.data.image_size, experiment.encoding.max_text_length
+def abstract_batch(experiment: Experiment, mesh: Mesh, picture: tuple[int, int] | None = None) -> dict[str, Any]:
+    """The arrays of a batch (see `data_pipelines.samples`) as shapes with shardings.
+
+    picture: height and width, those of simulated demonstrations if not given.
+    """
+    size = experiment.data.image_size
+    picture = picture or (size, size)
+    text = experiment.encoding.max_text_length
     leaves = {
-        "rgb": ((size, size, 3), jnp.uint8),
-        "depth": ((size, size), jnp.float32),
+        "rgb": ((*picture, 3), jnp.uint8),
+        "depth": (picture, jnp.float32),
         "intrinsics": ((3, 3), jnp.float32),
         "world_from_camera": ((4, 4), jnp.float32),
         "text_tokens": ((text,), jnp.int32),
@@ -214,7 +223,9 @@ def _placed(tree: Any, where: Any) -> Any:
     return jax.tree.map(lambda leaf, sharding: leaf.update(sharding=sharding), tree, where)
 
 
-def _bytes(tree: Any) -> int:
+def bytes_on_a_device(tree: Any) -> int:
+    """Of a tree of shapes with shardings, what each device holds."""
+
     def size(leaf: Any) -> int:
         sharding: NamedSharding = leaf.sharding
         return math.prod(sharding.shard_shape(leaf.shape)) * leaf.dtype.itemsize

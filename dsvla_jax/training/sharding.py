@@ -11,6 +11,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import AXIS_RULES, MESH_AXES
+from dsvla_jax.ranges import at_least, check_fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,12 +26,17 @@ class MeshConfig:
     fsdp: int = 1
     tensor: int = 1
 
+    def __post_init__(self) -> None:
+        sizes = {axis: getattr(self, axis) for axis in MESH_AXES}
+        check_fields(self, "mesh", **dict.fromkeys(sizes, at_least(-1)))
+        named = ", ".join(f"{axis}={size}" for axis, size in sizes.items())
+        if list(sizes.values()).count(-1) > 1 or 0 in sizes.values():
+            raise UserError(f"mesh: expected positive sizes, and -1 (the rest) for one axis at most; got {named}")
+
     def shape(self, devices: int) -> tuple[int, int, int]:
         """Sizes of the axes on so many devices. Raises UserError where they do not multiply to it."""
         sizes = [self.data, self.fsdp, self.tensor]
         named = ", ".join(f"{axis}={size}" for axis, size in zip(MESH_AXES, sizes, strict=True))
-        if sizes.count(-1) > 1 or any(size < 1 and size != -1 for size in sizes):
-            raise UserError(f"mesh: expected positive sizes, and -1 (the rest) for one axis at most; got {named}")
         known = math.prod(size for size in sizes if size != -1)
         if devices % known or (-1 not in sizes and known != devices):
             raise UserError(

@@ -47,8 +47,12 @@ def initial_state(
 ) -> tuple[TrainState, Variables]:
     """State and frozen variables at step 0: random by the seed, the towers of ``base`` in the place of random ones.
 
+    number_values: the tokenizer's; embeddings may have more rows than it has tokens.
     Pure: `make_sharded` makes every leaf where it lives, and none of them is ever whole on one device.
     """
+    if number_values is not None:
+        more = experiment.model.language.vocab_size - len(number_values)
+        number_values = np.pad(number_values, (0, more), constant_values=np.nan)
     variables = initialize(experiment.model, jax.random.key(experiment.seed), number_values)
     for collection, towers in (base or {}).items():
         variables[collection] = {**variables[collection], **towers}

@@ -1,6 +1,7 @@
 """Imported backbones on disk: what checkpoints of other projects become once, and models start from many times."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,13 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 
-from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.checkpoints import CheckpointError, require_same_shapes
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.quantize import SCALE, TOWERS, is_quantized, quantize_kernel
 from dsvla_jax.model.variables import MATRICES
 from dsvla_jax.model.vla import initialize
+from dsvla_jax.policy import load_policy_config
 from dsvla_jax.weights.folder import DESCRIPTION, create_weights, describe_weights, restore_weights
 from dsvla_jax.weights.llama_adapter import read_adapter
 from dsvla_jax.weights.sources import read_language, read_vision
@@ -140,6 +142,26 @@ def is_imported(folder: Path) -> bool:
     return (folder / DESCRIPTION).is_file()
 
 
+def require_same_model(folder: Path, model: ModelConfig) -> Towers:
+    """What a folder holds. Raises CheckpointError, naming the fields that differ, if it is of another model."""
+    towers = read_towers(folder)
+    if problems := _differences(towers, model):
+        raise CheckpointError(f"{folder}: weights of another model: {'; '.join(problems)}; change the config's values")
+    return towers
+
+
+def require_base(folder: Path, model: ModelConfig) -> None:
+    """Raises CheckpointError where a run or a folder of imported weights is missing, or is of another model."""
+    if is_imported(folder):
+        require_same_model(folder, model)
+        return
+    found, expected = (
+        jax.eval_shape(partial(initialize, config), jax.random.key(0))["params"]
+        for config in (load_policy_config(folder).model, model)
+    )
+    require_same_shapes(found, expected, folder)
+
+
 def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -> dict[str, Any]:
     """The variables in a folder for a model of these sizes, split over the mesh.
 
@@ -147,9 +169,7 @@ def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -
     What the folder does not hold is not there: it stays as the model initialises it. Kernels that the model keeps in 8
     bits are converted one after the other. Raises CheckpointError naming the fields of the config that differ.
     """
-    towers = read_towers(folder)
-    if problems := _differences(towers, model):
-        raise CheckpointError(f"{folder}: weights of another model: {'; '.join(problems)}; change the config's values")
+    towers = require_same_model(folder, model)
     full = dataclasses.replace(model, base_dtype="same")
     variables = jax.eval_shape(lambda: initialize(full, jax.random.key(0)))
     like: dict[str, Any] = {"params": {name: variables["params"][name] for name in present_towers(towers)}}

@@ -1,0 +1,41 @@
+"""Configs as JSON files: frozen dataclasses in and out."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cattrs
+
+from dsvla_jax.errors import UserError
+
+Config = TypeVar("Config")
+
+_converter = cattrs.Converter(forbid_extra_keys=True)
+
+
+def read_config(file: Path, cls: type[Config], what: str) -> Config:
+    """The config that a JSON file holds. Raises UserError naming the file and what is wrong in it.
+
+    what: what the file should be, for the message.
+    """
+    try:
+        return _converter.structure(json.loads(file.read_text()), cls)
+    except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
+        raise UserError(f"{file}: not {what} of this version: {'; '.join(_problems(error))}") from error
+
+
+def _problems(error: Exception) -> Iterator[str]:
+    """What is wrong: the messages of configs that refused their values, and what does not fit their fields."""
+    refused = list(_refusals(error))
+    if refused or not isinstance(error, cattrs.BaseValidationError):
+        yield from refused or [str(error)]
+    else:
+        yield from cattrs.transform_error(error)
+
+
+def _refusals(error: Any) -> Iterator[str]:
+    if isinstance(error, UserError):
+        yield str(error)
+    for part in getattr(error, "exceptions", ()):
+        yield from _refusals(part)

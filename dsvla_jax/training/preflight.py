@@ -1,0 +1,77 @@
+"""What can be known of a training step before anything is read, written or compiled: that its sizes fit, and memory."""
+
+import math
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from dsvla_jax.errors import UserError
+from dsvla_jax.model.variables import join_variables
+from dsvla_jax.model.vla import VLA
+from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.planning import abstract_batch, abstract_state, bytes_on_a_device
+from dsvla_jax.training.state import model_inputs
+
+
+def check_step(experiment: Experiment, mesh: Mesh, picture: tuple[int, int]) -> None:
+    """Traces the network on a batch of shapes, which takes a second or two and allocates nothing.
+
+    picture: height and width of the pictures that the run learns from.
+    Raises UserError where the sizes of the config do not fit together, or cannot fit the devices' memory: what is
+    counted is a lower bound, so a step that passes may still be too large.
+    """
+    state, frozen, _ = abstract_state(experiment, mesh)
+    memory = device_memory()
+    held = bytes_on_a_device((state, frozen))
+    if held > memory:
+        raise UserError(
+            f"model: parameters and optimizer take {_gib(held)} of each device, which has {_gib(memory)}; use a smaller"
+            " model, regime lora, or split them over more devices (--mesh.fsdp)"
+        )
+    batch = abstract_batch(experiment, mesh, picture)
+
+    def logits(trainable: Any, frozen: Any, batch: Any) -> Any:
+        return VLA(experiment.model).apply(join_variables(trainable, frozen), model_inputs(batch, experiment.encoding))
+
+    largest = max(_outputs(jax.make_jaxpr(logits)(state.trainable, frozen, batch).jaxpr), key=_bytes)
+    # A batch is computed in parts, and at best every array is split over all devices.
+    needed = _bytes(largest) / experiment.gradient_accumulation / mesh.size
+    if needed > memory:
+        raise UserError(
+            f"batch_size: an array of shape {largest.shape} of one step takes {_gib(needed)} of each device, which "
+            f"has {_gib(memory)}; lower --batch-size or other sizes, or raise --gradient-accumulation"
+        )
+
+
+def device_memory() -> float:
+    """Bytes of one device; those of the machine's memory, shared by its devices, for processors; inf if unknown."""
+    devices = jax.local_devices()
+    if limit := (devices[0].memory_stats() or {}).get("bytes_limit"):
+        return limit
+    if devices[0].platform != "cpu":
+        return math.inf
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / len(devices)
+
+
+def _outputs(jaxpr: Any) -> Iterator[Any]:
+    """The shapes of all that a program computes, inner programs included."""
+    for equation in jaxpr.eqns:
+        yield from (variable.aval for variable in equation.outvars if hasattr(variable.aval, "shape"))
+        for parameter in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
+            if _is_program(parameter):
+                yield from _outputs(getattr(parameter, "jaxpr", parameter))
+
+
+def _is_program(value: Any) -> bool:
+    return hasattr(value, "eqns") or hasattr(getattr(value, "jaxpr", None), "eqns")
+
+
+def _bytes(aval: Any) -> int:
+    return math.prod(aval.shape) * getattr(aval.dtype, "itemsize", 4)
+
+
+def _gib(count: float) -> str:
+    return f"{count / 2**30:,.1f} GiB"
