@@ -7,7 +7,6 @@ Results of another checkpoint that are replaced move to the file that --step nam
 
 import contextlib
 import dataclasses
-import math
 import sys
 import time
 from collections.abc import Sequence
@@ -20,11 +19,12 @@ import tyro
 
 import dsvla_jax.policy
 from dsvla_jax.checkpoints import RunCheckpoints
-from dsvla_jax.command_line import configure_jax, fail_with_message, require_each_option_once
+from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.errors import UserError
 from dsvla_jax.files import write_picture
 from dsvla_jax.model.decode import Decoding
 from dsvla_jax.policy import Policy
+from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.report import (
     EpisodeResult,
     film_strip,
@@ -82,15 +82,15 @@ class Options:
     """The folder for results and report; RUN/eval if not given."""
 
     def __post_init__(self) -> None:
-        ranges = {
-            "episodes": (self.episodes is None or self.episodes >= 1, "at least 1", self.episodes),
-            "batch": (self.batch >= 1, "at least 1", self.batch),
-            "keypoint-noise": (0 <= self.keypoint_noise < math.inf, "metres, 0 or more", self.keypoint_noise),
-            "seed": (0 <= self.seed < 2**31, "0 to 2147483647", self.seed),
-        }
-        for field, (holds, expected, got) in ranges.items():
-            if not holds:
-                raise UserError(f"--{field}: expected {expected}, got {got}")
+        check_fields(
+            self,
+            "",
+            episodes=at_least(1),
+            batch=at_least(1),
+            keypoint_noise=at_least(0),
+            step=at_least(0),
+            seed=at_least(0),
+        )
 
     @property
     def results(self) -> Path:
@@ -239,8 +239,7 @@ def load_strips(file: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str,
 def program() -> None:
     """Runs the program: `python eval.py`, or `dsvla-eval` where the project is installed."""
     with fail_with_message():
-        require_each_option_once(sys.argv[1:])
-        parsed = tyro.cli(Options, prog="eval.py", description=__doc__)
+        parsed = parse_options(Options, prog="eval.py", description=__doc__)
         configure_jax(parsed.physics)
         started = time.monotonic()
         main(parsed)

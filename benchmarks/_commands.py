@@ -160,7 +160,7 @@ def problem_with_program(words: list[str]) -> str | None:
     if file is None or not file.exists():
         return f"no program {module or words[0]}"
     source = file.read_text()
-    if not re.search(r"tyro\.cli\(|subcommand_cli|parse_args\(", source):
+    if not re.search(r"tyro\.cli\(|parse_options\(|subcommand_cli|parse_args\(", source):
         option = next((word for word in arguments if word.startswith("-") and word != "--help"), None)
         return f"{module} has no option {option}" if option else None
     output = io.StringIO()

@@ -8,7 +8,6 @@ the result is the same.
 
 import contextlib
 import dataclasses
-import math
 import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -24,10 +23,11 @@ from tqdm import tqdm
 from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
 from data_pipelines.processes import complete_in_processes
 from data_pipelines.records import Episode, make_episode, mark_missing
-from dsvla_jax.command_line import configure_jax, ended_by_sigterm, fail_with_message
+from dsvla_jax.command_line import configure_jax, ended_by_sigterm, fail_with_message, parse_options
 from dsvla_jax.encoding.keypoints import replay_latch
-from dsvla_jax.errors import UserError, require
+from dsvla_jax.errors import UserError
 from dsvla_jax.files import hold_folder
+from dsvla_jax.ranges import Range, at_least, check_fields, require
 from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
@@ -63,11 +63,16 @@ class Settings:
     """Episodes simulated at a time, and attempts a shard."""
 
     def __post_init__(self) -> None:
-        require(self.image_size > 0, "image_size", "at least 1 pixel", self.image_size)
-        require(self.seed >= 0, "seed", "0 or more", self.seed)
-        require(0 <= self.perturb < math.inf, "perturb", "0 or more metres", self.perturb)
-        require(0 <= self.perturb_probability <= 1, "perturb_probability", "0 to 1", self.perturb_probability)
-        require(self.batch > 0, "batch", "at least 1 episode", self.batch)
+        check_fields(self, "", **self._ranges())
+
+    def _ranges(self) -> dict[str, Range]:
+        return {
+            "image_size": at_least(1),
+            "seed": at_least(0),
+            "perturb": at_least(0),
+            "perturb_probability": at_least(0, 1),
+            "batch": at_least(1),
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,10 +88,8 @@ class Options(Settings):
     workers: int = os.cpu_count() or 1
     """Processes, each at work on one task."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.episodes > 0, "episodes", "at least 1 a task", self.episodes)
-        require(self.workers > 0, "workers", "at least 1 process", self.workers)
+    def _ranges(self) -> dict[str, Range]:
+        return {**super()._ranges(), "episodes": at_least(1), "workers": at_least(1)}
 
 
 class ScriptedExpert:
@@ -196,7 +199,7 @@ def generate_demonstrations(
     demonstrator: (task name, settings) -> the function that attempts episodes; made only when something is missing.
     workers: processes at work on a task each; 1 works in this one.
     """
-    require(episodes > 0, "episodes", "at least 1 a task", episodes)
+    require(episodes > 0, "episodes", "at least 1", episodes)
     wanted = Settings(**settings)
     folder = Path(folder)
 
@@ -322,6 +325,6 @@ def main(options: Options) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
-        parsed = tyro.cli(Options, prog="python -m data_pipelines.demos", description=__doc__)
+        parsed = parse_options(Options, prog="python -m data_pipelines.demos", description=__doc__)
         configure_jax()
         main(parsed)

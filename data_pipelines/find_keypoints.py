@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from data_pipelines.episodes import INDEX_FILE, EpisodeReader, write_episodes
 from data_pipelines.records import Episode, decode_depth, decode_rgb
-from dsvla_jax.command_line import fail_with_message
+from dsvla_jax.command_line import fail_with_message, parse_options
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.files import hold_folder, write_picture
@@ -100,4 +100,4 @@ def main(options: Options) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
-        main(tyro.cli(Options, prog="python -m data_pipelines.find_keypoints", description=__doc__))
+        main(parse_options(Options, prog="python -m data_pipelines.find_keypoints", description=__doc__))

@@ -11,7 +11,7 @@ from pathlib import Path
 import tyro
 
 from data_pipelines.episodes import EpisodeReader
-from dsvla_jax.command_line import fail_with_message
+from dsvla_jax.command_line import fail_with_message, parse_options
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.sim.tasks import TASKS
 
@@ -38,5 +38,5 @@ def write_vocabulary(out: Path, texts: Iterable[str]) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
-        options = tyro.cli(Options, prog="python -m data_pipelines.vocabulary", description=__doc__)
+        options = parse_options(Options, prog="python -m data_pipelines.vocabulary", description=__doc__)
         write_vocabulary(options.out, EpisodeReader(options.folder).instructions)

@@ -21,9 +21,10 @@ from data_pipelines.keyframes import (
 from data_pipelines.recording import Recording, check_recording, make_demonstration
 from data_pipelines.records import Episode, decode_frame, picture_size
 from dsvla_jax.encoding.codec import PoseCodec
-from dsvla_jax.errors import DataError, UserError, require
+from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.files import hold_folder
 from dsvla_jax.observation_checks import check_surface
+from dsvla_jax.ranges import at_least, require
 
 EPISODES_PER_SHARD = 20
 
@@ -53,9 +54,9 @@ class DemonstrationWriter:
         still: float = STILL,
         stop_buffer: int = STOP_BUFFER,
     ):
-        require(every_n >= 0, "every_n", "0 or more observations", every_n)
-        require(0 <= still < math.inf, "still", "0 or more radians per second", still)
-        require(stop_buffer >= 0, "stop_buffer", "0 or more observations", stop_buffer)
+        require(every_n >= 0, "every_n", at_least(0), every_n)
+        require(0 <= still < math.inf, "still", at_least(0), still)
+        require(stop_buffer >= 0, "stop_buffer", at_least(0), stop_buffer)
         self.folder, self.every_n, self.codec = Path(folder), every_n, codec or PoseCodec()
         self.still, self.stop_buffer = still, stop_buffer
         self._discovered = self._restless = 0

@@ -158,7 +158,9 @@ def parse_options(options: Any, **settings: Any) -> Any:
     """`tyro.cli`, but for values that a config refuses: those end in the config's own message (UserError).
 
     options: what tyro makes an object of; if a function, one that only returns what it is given. settings: as tyro's.
+    Raises UserError for an option that is given twice, too.
     """
+    require_each_option_once(settings.get("args", sys.argv[1:]))
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):

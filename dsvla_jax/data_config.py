@@ -107,7 +107,9 @@ class OxeConfig:
             streams=at_least(1),
         )
         require_folder("oxe.folder", self.folder)
-        require(bool(_names(self.mixture)), "oxe.mixture", "a named mixture or names of datasets", self.mixture)
+        # None at all is for programs that read a single build, which no mixture names.
+        names = _names(self.mixture)
+        require(bool(names) or not self.mixture, "oxe.mixture", "a named mixture or names of datasets", self.mixture)
         require(bool(self.split), "oxe.split", "the name of a split, such as train", repr(self.split))
 
 

@@ -5,7 +5,6 @@ prompt, the answer with how probable each number was, and where the arm went.
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,12 +14,13 @@ import numpy as np
 import tyro
 
 import dsvla_jax.policy
-from dsvla_jax.command_line import configure_jax, fail_with_message, require_each_option_once
+from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.policy import Decision, Policy
+from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.report import mark_targets, png_data, require_writable, write_html
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.rollout_keypoints import keypoint_source
@@ -48,8 +48,7 @@ class Options:
     """The page; RUN/demo.html if not given."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**31:
-            raise UserError(f"--seed: expected 0 to 2147483647, got {self.seed}")
+        check_fields(self, "", seed=at_least(0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +159,6 @@ def main(options: Options) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
-        require_each_option_once(sys.argv[1:])
-        parsed = tyro.cli(Options, prog="python -m dsvla_jax.demo", description=__doc__)
+        parsed = parse_options(Options, prog="python -m dsvla_jax.demo", description=__doc__)
         configure_jax()
         main(parsed)

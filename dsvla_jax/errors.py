@@ -7,12 +7,6 @@ class UserError(ValueError):
     """The input is at fault, not the code: the message names what was wrong, what was expected, and the fix."""
 
 
-def require(holds: bool, field: str, expected: str, got: object) -> None:
-    """Raises UserError naming the field, what was expected and what was given, unless the condition holds."""
-    if not holds:
-        raise UserError(f"{field}: expected {expected}, got {got}")
-
-
 class DataError(UserError):
     """Recorded data that must not be used: says which file and field, what was expected, and what to do about it."""
 

@@ -86,9 +86,9 @@ def check_fields(config: Any, section: str, **ranges: Range) -> None:
     prefix = f"{section}." if section else ""
     for name, kind in kinds.items():
         value, option = getattr(config, name), prefix + name
-        if kind.choices:
+        if kind.choices and not kind.number:
             require(value in kind.choices, option, f"one of {', '.join(map(str, kind.choices))}", repr(value))
-        if kind.number:
+        if kind.number and value not in kind.choices:
             numbers = value if isinstance(value, tuple) else () if value is None else (value,)
             require(kind.count in (None, len(numbers)), option, f"{kind.count} numbers", value)
             for number in numbers:
@@ -97,7 +97,10 @@ def check_fields(config: Any, section: str, **ranges: Range) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Kind:
-    """What a field may hold. number: int or float, also in a tuple or beside None. count: how many, None for any."""
+    """What a field may hold. number: int or float, also in a tuple or beside None. count: how many, None for any.
+
+    choices: words that it may hold, instead of or beside a number.
+    """
 
     number: type | None = None
     count: int | None = None
@@ -125,7 +128,9 @@ def _kind(hint: Any) -> _Kind:
     if origin is Literal:
         return _Kind(choices=arguments)
     if origin in (tuple, typing.Union, types.UnionType):
-        numbers = {kind.number for kind in map(_kind, arguments) if kind.number}
+        kinds = [_kind(argument) for argument in arguments]
+        numbers = {kind.number for kind in kinds if kind.number}
         count = len(arguments) if origin is tuple and Ellipsis not in arguments else None
-        return _Kind(numbers.pop(), count) if len(numbers) == 1 else _Kind()
+        choices = tuple(choice for kind in kinds for choice in kind.choices)
+        return _Kind(numbers.pop(), count, choices) if len(numbers) == 1 else _Kind()
     return _Kind()

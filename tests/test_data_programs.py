@@ -13,10 +13,10 @@ def test_numbers_of_the_other_data_programs_have_their_range(tmp_path):
     for wrong in ({"episodes": 0}, {"episodes": -3}, {"steps": 1}):
         with pytest.raises(UserError, match=f"{next(iter(wrong))}: expected at least"):
             fixtures(tmp_path / "new", ("viola",), **wrong)
-    with pytest.raises(UserError, match="seed: expected 0 or more, got -1"):
+    with pytest.raises(UserError, match="seed: expected at least 0, got -1"):
         prepare(OxeConfig(folder=str(tmp_path), mixture=("viola",)), seed=-1)
-    with pytest.raises(UserError, match="episodes: expected at least 1 to draw, got -3"):
+    with pytest.raises(UserError, match="episodes: expected at least 1, got -3"):
         InspectOptions(path=str(tmp_path), episodes=-3)
-    with pytest.raises(UserError, match="box_threshold: expected 0 to 1"):
+    with pytest.raises(UserError, match="box_threshold: expected at least 0, at most 1"):
         GroundingOptions(box_threshold=-0.1)
     assert not (tmp_path / "new").exists()

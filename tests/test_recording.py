@@ -275,6 +275,6 @@ def test_a_camera_on_the_wrist_need_not_see_the_keypoints(tmp_path):
 
 @pytest.mark.parametrize("option", [{"every_n": -1}, {"still": -0.1}, {"still": np.nan}, {"stop_buffer": -1}])
 def test_numbers_of_the_writer_have_their_range(tmp_path, option):
-    with pytest.raises(UserError, match=f"{next(iter(option))}: expected 0 or more"):
+    with pytest.raises(UserError, match=f"{next(iter(option))}: expected at least 0"):
         DemonstrationWriter(tmp_path / "new", **option)
     assert not (tmp_path / "new").exists()

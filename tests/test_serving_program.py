@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tyro
 
 from configs.tiny import config as tiny_config
 from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
 from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.command_line import parse_options
 from dsvla_jax.data_config import DataConfig, LearnedFrom, OxeConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.policy import load_policy_config, save_policy_config
@@ -78,22 +78,20 @@ def test_a_run_of_an_older_version_is_served_as_its_config_says(tmp_path):
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (["--batch", "0"], "batch: expected 1 to 128, got 0"),
-        (["--clients", "0"], "clients: expected 1"),
-        (["--instruction-tokens", "0"], "instruction-tokens: expected 1"),
-        (["--request-seconds", "-1"], "request-seconds: expected"),
-        (["--idle-seconds", "nan"], "idle-seconds: expected"),
-        (["--port", "70000"], "port: expected 1 to 65535, got 70000"),
-        (["--port", "0"], "port: expected 1"),
-        (["--arms", "3"], "arms: expected 1 to 2, got 3"),
-        (["--box-threshold", "7"], "box-threshold: expected 0 to 1"),
+        (["--batch", "0"], "batch: expected at least 1, at most 128, got 0"),
+        (["--clients", "0"], "clients: expected at least 1"),
+        (["--instruction-tokens", "0"], "instruction_tokens: expected at least 1"),
+        (["--request-seconds", "-1"], "request_seconds: expected"),
+        (["--idle-seconds", "nan"], "idle_seconds: expected"),
+        (["--port", "70000"], "port: expected at least 1, at most 65535, got 70000"),
+        (["--port", "0"], "port: expected at least 1"),
+        (["--arms", "3"], r"arms: expected at least 1, at most 2, got \(3,\)"),
+        (["--box-threshold", "7"], "box_threshold: expected at least 0, at most 1"),
     ],
 )
-def test_an_option_out_of_its_range_is_named(options, complaint, capsys):
-    with pytest.raises(SystemExit):
-        tyro.cli(Options, args=["runs/none", *options])
-    told = " ".join(capsys.readouterr().err.replace("│", " ").split())
-    assert complaint in told
+def test_an_option_out_of_its_range_is_named(options, complaint):
+    with pytest.raises(UserError, match=complaint):
+        parse_options(Options, args=["runs/none", *options])
 
 
 @pytest.mark.parametrize("size", ["0x0", "96", "96x", "-1x5", "99999x10", "²x5", "8x8"])

@@ -14,11 +14,12 @@ import tyro
 from data_pipelines.episodes import INDEX_FILE
 from data_pipelines.inspect.episodes import describe_episodes
 from data_pipelines.inspect.page import Page, print_page, write_page
-from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.prompts import Style
-from dsvla_jax.errors import DataError, require
+from dsvla_jax.errors import DataError
+from dsvla_jax.ranges import FINITE, at_least, check_fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,13 +37,14 @@ class Options:
     style: Style = "compact"
     """Of the prompts on the page."""
     workspace_low: tuple[float, float, float] = EncodingConfig.workspace_low
+    """The lowest corner of the box that clouds are cut to, metres, as in the config to train with."""
     workspace_high: tuple[float, float, float] = EncodingConfig.workspace_high
-    """Corners of the box that clouds are cut to, metres, as in the config to train with."""
+    """The highest corner of that box."""
     oxe: OxeConfig = dataclasses.field(default_factory=lambda: OxeConfig(mixture=()))
     """Of RLDS builds, as in the config to train with. With a mixture, displacements are binned over that."""
 
     def __post_init__(self) -> None:
-        require(self.episodes > 0, "episodes", "at least 1 to draw", self.episodes)
+        check_fields(self, "", episodes=at_least(1), workspace_low=FINITE, workspace_high=FINITE)
 
 
 def describe(options: Options) -> tuple[Page, str]:
@@ -78,6 +80,6 @@ def main(options: Options) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
-        parsed = tyro.cli(Options, prog="python -m data_pipelines.inspect", description=__doc__)
+        parsed = parse_options(Options, prog="python -m data_pipelines.inspect", description=__doc__)
         configure_jax()
         main(parsed)

@@ -22,7 +22,7 @@ from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.vocabulary import write_vocabulary
 from dsvla_jax.command_line import fail_with_message
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.errors import require
+from dsvla_jax.ranges import at_least, require
 
 
 def list_(names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
@@ -50,7 +50,7 @@ def prepare(config: Annotated[OxeConfig, tyro.conf.arg(name="")], seed: int = 0)
         config: the mixture, as training takes it.
         seed: of the order.
     """
-    require(seed >= 0, "seed", "0 or more", seed)
+    require(seed >= 0, "seed", at_least(0), seed)
     source = MixtureSource(config, seed)
     table = Table("dataset", "episodes", "samples", "share", "left out", "MB a window")
     for item, share in zip(source.datasets, source.shares, strict=True):
@@ -94,8 +94,8 @@ def fixtures(
         episodes: of each.
         steps: of the shortest episode.
     """
-    require(episodes > 0, "episodes", "at least 1 of each dataset", episodes)
-    require(steps > 1, "steps", "at least 2 of an episode", steps)
+    require(episodes > 0, "episodes", at_least(1), episodes)
+    require(steps > 1, "steps", at_least(2), steps)
     names = [get_dataset(name).name for name in datasets] or sorted(DATASETS)
     write_fixtures(folder, names, episodes, steps)
     print(f"{len(names)} builds in {folder}")

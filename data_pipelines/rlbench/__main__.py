@@ -5,7 +5,6 @@ SRC is a folder of tasks as RLBench's generators write it. OUT receives episodes
 """
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,10 +26,11 @@ from data_pipelines.keyframes import (
 from data_pipelines.recording import make_demonstration
 from data_pipelines.records import Episode
 from data_pipelines.rlbench.files import find_episodes, left_aside, read_recording
-from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.digests import file_digest
-from dsvla_jax.errors import DataError, require
+from dsvla_jax.errors import DataError
 from dsvla_jax.files import hold_folder
+from dsvla_jax.ranges import Range, at_least, check_fields, require
 
 EPISODES_PER_SHARD = 20
 
@@ -53,9 +53,10 @@ class Settings:
 
     def __post_init__(self) -> None:
         require(bool(self.camera), "camera", "a name", repr(self.camera))
-        require(self.every_n >= 0, "every_n", "0 or more observations", self.every_n)
-        require(0 <= self.still < math.inf, "still", "0 or more radians per second", self.still)
-        require(self.stop_buffer >= 0, "stop_buffer", "0 or more observations", self.stop_buffer)
+        check_fields(self, "", **self._ranges())
+
+    def _ranges(self) -> dict[str, Range]:
+        return {"every_n": at_least(0), "still": at_least(0), "stop_buffer": at_least(0)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +74,8 @@ class Options(Settings):
     skip_bad: bool = False
     """Leave out damaged episodes, and list them, instead of stopping at the first."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.episodes is None or self.episodes > 0, "episodes", "at least 1", self.episodes)
+    def _ranges(self) -> dict[str, Range]:
+        return {**super()._ranges(), "episodes": at_least(1)}
 
 
 def contact_keypoints(pose: np.ndarray, gripper_open: np.ndarray) -> np.ndarray:
@@ -235,6 +235,6 @@ def report(out: Path, skipped: list[dict[str, Any]]) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
-        parsed = tyro.cli(Options, prog="python -m data_pipelines.rlbench", description=__doc__)
+        parsed = parse_options(Options, prog="python -m data_pipelines.rlbench", description=__doc__)
         configure_jax()
         main(parsed)

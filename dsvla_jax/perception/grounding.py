@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from dsvla_jax.errors import UserError, require
+from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import ONE_END, OTHER_END, Sighting
 from dsvla_jax.perception.phrases import ObjectPhrases, load_table
+from dsvla_jax.ranges import at_least, check_fields
 
 DETECTOR = "IDEA-Research/grounding-dino-tiny"
 SEGMENTER = "facebook/sam-vit-huge"
@@ -35,7 +36,7 @@ class GroundingOptions:
     """A JSON file of {"regular expression": ["phrase", ...]} for instructions that are not the suite's."""
 
     def __post_init__(self) -> None:
-        require(0 <= self.box_threshold <= 1, "box_threshold", "0 to 1", self.box_threshold)
+        check_fields(self, "", box_threshold=at_least(0, 1))
 
     def segmenter(self) -> "GroundedSegmenter":
         """Loads the models. Raises UserError."""

@@ -14,13 +14,14 @@ from typing import Literal
 import tyro
 
 from dsvla_jax import policy as policies
-from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.errors import UserError
 from dsvla_jax.perception.grounding import GroundingOptions
 from dsvla_jax.policy import PolicyConfig
+from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.rollout_keypoints import suite_phrases
-from dsvla_jax.serving.server import Limits, Perception, PolicyServer, require_range
+from dsvla_jax.serving.server import Limits, Perception, PolicyServer
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.training.experiment import load_experiment
 
@@ -51,10 +52,7 @@ class Options:
     limits: tyro.conf.OmitArgPrefixes[Limits] = dataclasses.field(default_factory=Limits)
 
     def __post_init__(self) -> None:
-        require_range("port", self.port, 1, 65535)
-        for arms in self.arms:
-            require_range("arms", arms, 1, 2)
-        require_range("box_threshold", self.grounding.box_threshold, 0, 1)
+        check_fields(self, "", port=at_least(1, 65535), arms=at_least(1, 2))
 
 
 def build_server(options: Options) -> PolicyServer:
@@ -158,7 +156,7 @@ def _is_loopback(host: str) -> bool:
 
 if __name__ == "__main__":
     with fail_with_message():
-        parsed = tyro.cli(Options, prog="python -m dsvla_jax.serving", description=__doc__)
+        parsed = parse_options(Options, prog="python -m dsvla_jax.serving", description=__doc__)
         logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s", force=True)
         logging.getLogger("dsvla_jax").setLevel(logging.INFO)
         configure_jax()

@@ -26,6 +26,7 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import KeypointTracker, Segmenter
 from dsvla_jax.perception.phrases import ObjectPhrases, phrases_for
 from dsvla_jax.policy import BATCH_SIZES, Policy
+from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.serving.batching import (
     Answer,
     MicroBatcher,
@@ -73,16 +74,17 @@ class Limits:
     """Between two requests of a robot."""
 
     def __post_init__(self) -> None:
-        for field, most in (("clients", 10_000), ("batch", BATCH_SIZES[-1]), ("instruction_tokens", 100_000)):
-            require_range(field, getattr(self, field), 1, most)
-        for field in ("request_seconds", "message_seconds", "idle_seconds"):
-            require_range(field, getattr(self, field), 0.001, 1e9)
-
-
-def require_range(option: str, value: float, low: float, high: float) -> None:
-    """Raises UserError unless the option's value is from ``low`` to ``high``."""
-    if not low <= value <= high:
-        raise UserError(f"--{option.replace('_', '-')}: expected {low:g} to {high:g}, got {value}")
+        seconds = at_least(0.001, 1e9)
+        check_fields(
+            self,
+            "",
+            clients=at_least(1, 10_000),
+            batch=at_least(1, BATCH_SIZES[-1]),
+            instruction_tokens=at_least(1, 100_000),
+            request_seconds=seconds,
+            message_seconds=seconds,
+            idle_seconds=seconds,
+        )
 
 
 @dataclasses.dataclass(frozen=True)

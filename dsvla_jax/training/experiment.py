@@ -136,6 +136,8 @@ class Experiment:
             keep_checkpoints=at_least(1),
             max_skipped_steps=at_least(0),
         )
+        if self.oxe is not None:
+            require(bool(self.oxe.mixture), "oxe.mixture", "a named mixture or names of datasets", self.oxe.mixture)
         require_same_sizes(self.encoding, self.model)
         adapters = self.regime == "full" or self.model.lora is not None
         require(adapters, "regime", "'full' without adapters", repr(self.regime), "give the config a model.lora")

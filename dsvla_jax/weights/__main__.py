@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from dsvla_jax.command_line import fail_with_message
+from dsvla_jax.command_line import fail_with_message, parse_options
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.model.config import VisualPromptConfig
 from dsvla_jax.policy import load_policy_config
@@ -99,7 +99,7 @@ def main() -> None:
         print(__doc__)
         sys.exit(0 if name in ("", "-h", "--help") else 2)
     with fail_with_message():
-        tyro.cli(commands[name], args=sys.argv[2:], prog=f"python -m dsvla_jax.weights {name}")
+        parse_options(commands[name], args=sys.argv[2:], prog=f"python -m dsvla_jax.weights {name}")
 
 
 if __name__ == "__main__":
