@@ -108,7 +108,8 @@ class _Kind:
 
 
 def _check_number(option: str, number: Any, kind: type, allowed: Range, whole: Any) -> None:
-    right, expected = (Integral, "a whole number") if kind is int else (Real, "a number")
+    right: Any = Integral if kind is int else Real
+    expected = "a whole number" if kind is int else "a number"
     require(isinstance(number, right) and not isinstance(number, bool), option, expected, repr(whole))
     require(number in allowed, option, allowed, whole)
     largest = LARGEST_COUNT if kind is int else LARGEST_NUMBER

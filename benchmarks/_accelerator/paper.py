@@ -217,8 +217,8 @@ def decode(job: Job) -> None:
             rgb=jnp.asarray(seen["rgb"]),
             depth=jnp.asarray(seen["depth"]),
             camera=Camera(jnp.asarray(seen["intrinsics"]), jnp.asarray(seen["world_from_camera"])),
-            pose=seen["pose"],
-            gripper_open=seen["gripper_open"],
+            pose=jnp.asarray(seen["pose"]),
+            gripper_open=jnp.asarray(seen["gripper_open"]),
         )
         instructions = [one["instruction"] for one in asked]
         decision, timing = timed(
