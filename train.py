@@ -37,7 +37,7 @@ from dsvla_jax.checkpoints import RunCheckpoints, has_checkpoints, require_same_
 from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory, parse_options
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.number_targets import number_rows
-from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
+from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import make_sharded
@@ -61,9 +61,6 @@ from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
 from dsvla_jax.weights.base import is_imported, load_for_model, require_base
-
-# Embeddings have more rows than the vocabulary has tokens where their number was rounded up, by fewer than so many.
-PADDING_ROWS = 1024
 
 
 def prepare(
@@ -318,7 +315,7 @@ def tokenizer_of(experiment: Experiment) -> Tokenizer:
     """The vocabulary of the experiment, which has to be that of its language model."""
     tokenizer = load_tokenizer(experiment.tokenizer) if experiment.tokenizer else suite_tokenizer()
     expected = experiment.model.language.vocab_size
-    if not tokenizer.vocab_size <= expected < tokenizer.vocab_size + PADDING_ROWS:
+    if not fits_rows(tokenizer, expected):
         raise UserError(
             f"tokenizer: {experiment.tokenizer or 'the words of the task suite'} has {tokenizer.vocab_size} tokens, "
             f"model.language.vocab_size is {expected}; they must be of one language model"
@@ -333,7 +330,13 @@ def base_variables(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str,
     folder = Path(experiment.base)
     if is_imported(folder):
         return load_for_model(folder, experiment.model, mesh, frozen=experiment.regime != "full")
-    params = dsvla_jax.policy.load(folder, mesh).variables["params"]
+    policy = dsvla_jax.policy.load(folder, mesh)
+    if policy.tokenizer != tokenizer_of(experiment):
+        raise UserError(
+            f"base: {folder} was trained with another vocabulary, whose tokens its embedding stands for; train with "
+            f"that one: --tokenizer {folder}"
+        )
+    params = policy.variables["params"]
     expected = jax.eval_shape(lambda: initialize(experiment.model, jax.random.key(0)))
     require_same_shapes(params, expected["params"], folder)
     return {"params": params}

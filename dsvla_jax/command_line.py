@@ -116,11 +116,42 @@ def cache_folder() -> Path | None:
     return folder
 
 
+# What decides random draws, with JAX's own defaults.
+DRAWS = {"jax_enable_x64": False, "jax_threefry_partitionable": True, "jax_default_prng_impl": "threefry2x32"}
+
+
+def require_usual_draws() -> None:
+    """Raises UserError where JAX is set to draw other numbers from the same keys: episodes would start otherwise."""
+    for name, value in DRAWS.items():
+        if (found := getattr(jax.config, name)) != value:
+            raise UserError(
+                f"{name.upper()}: expected {value}, got {found}: the same seeds would give other episodes and losses, "
+                "which compare with no other run's; unset it"
+            )
+
+
+def _require_platform() -> None:
+    """Raises UserError where the user asked for devices that this machine or this installation lacks."""
+    asked = jax.config.jax_platforms
+    if not asked:
+        return
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:
+        reason = f" ({error})" if str(error) else ""
+        raise UserError(
+            f"JAX_PLATFORMS={asked}: no such device here, or jax is installed without support for it{reason}; install "
+            "that (https://docs.jax.dev/en/latest/installation.html), or unset JAX_PLATFORMS"
+        ) from error
+
+
 def configure_jax(physics: str = "mujoco") -> None:
     """Keeps compiled programs on disk, so that the second run of anything starts at once. Call it before any array.
 
-    physics: "mjx" if MJX will run.
+    physics: "mjx" if MJX will run. Raises UserError where JAX's settings would change results, or name devices that
+    are not there.
     """
+    require_usual_draws()
     if physics == "mjx" and jax.__version_info__ < (0, 11):
         # Among several threads, XLA's CPU client of jax 0.10 loses large programs of MJX (stack_blocks'), which then
         # never end. It reads this when it starts; MJX's arrays are too small to gain from threads.
@@ -134,6 +165,7 @@ def configure_jax(physics: str = "mujoco") -> None:
     # A cache whose disk fills up later costs time only, and JAX would say so for every program.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    _require_platform()
 
 
 # From glibc's malloc.h: how many blocks may be pages of their own, the free memory at the end that is handed back, and

@@ -20,7 +20,7 @@ from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
 from dsvla_jax.encoding.grammar import build_answer_grammar
-from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer
+from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer, save_tokenizer, vocabulary_digest
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.encoding.text import Tokenizer, quoted, unknown_words
 from dsvla_jax.errors import UserError
@@ -44,6 +44,8 @@ class PolicyConfig:
     """The range of answers that say where to go from the present pose; None for answers that are poses."""
     learned_from: LearnedFrom | None = None
     """None for runs of versions that did not keep it."""
+    vocabulary: str | None = None
+    """What `vocabulary_digest` gives for the run's vocabulary; None in runs from before it was written."""
 
     @property
     def wants_keypoints(self) -> bool:
@@ -176,6 +178,7 @@ def full_size(size: int) -> int:
 
 def save_policy_config(run: Path, config: PolicyConfig, tokenizer: Tokenizer) -> None:
     """Writes what `load` needs besides a checkpoint."""
+    config = dataclasses.replace(config, vocabulary=vocabulary_digest(tokenizer))
     (run / "policy.json").write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
     save_tokenizer(tokenizer, run)
 
@@ -193,6 +196,17 @@ def load_policy_config(run: Path) -> PolicyConfig:
         raise CheckpointError(f"{error}; train the run again") from error
 
 
+def load_vocabulary(run: Path, config: PolicyConfig) -> Tokenizer:
+    """The vocabulary of a run folder. Raises CheckpointError where it is not the one that the run was trained with."""
+    tokenizer, rows = load_tokenizer(run), config.model.language.vocab_size
+    if not fits_rows(tokenizer, rows) or config.vocabulary not in (None, vocabulary_digest(tokenizer)):
+        raise CheckpointError(
+            f"{run}: its tokenizer files are not those that it was trained with: {tokenizer.vocab_size} tokens for an "
+            f"embedding of {rows} rows, or other tokens, or in another order; copy them from the original run folder"
+        )
+    return tokenizer
+
+
 def load(
     run: Path,
     mesh: jax.sharding.Mesh | None = None,
@@ -205,7 +219,7 @@ def load(
     Raises CheckpointError naming what is missing or does not fit.
     """
     config = load_policy_config(run)
-    tokenizer = load_tokenizer(run)
+    tokenizer = load_vocabulary(run, config)
     like = jax.eval_shape(lambda: initialize(config.model, jax.random.key(0)))
     if mesh is not None:
         like = jax.tree.map(lambda leaf, where: leaf.update(sharding=where), like, shardings(like, mesh))

@@ -209,6 +209,29 @@ def test_adapters_that_the_visual_prompt_does_not_see_are_not_merged(tmp_path):
     assert export(tmp_path / "run", tmp_path / "out", model) == ["language", "vision", "projector"]
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"merged": True, "shard_bytes": 0.0}, "size of a file: expected more than 0 GB, got 0"),
+        ({"merged": True, "shard_bytes": -1e9}, "expected more than 0 GB, got -1"),
+        ({"merged": True, "shard_bytes": float("nan")}, "expected more than 0 GB, got nan"),
+        ({"merged": True, "bases": {"language": "a/b", "vision": None}}, "a base is noted in adapters only"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(run, tmp_path, options, message):
+    with pytest.raises(UserError, match=message):
+        export(run[0], tmp_path / "out", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_base_for_a_tower_without_adapters_is_refused(tmp_path):
+    model = dataclasses.replace(CONFIG, lora=dataclasses.replace(LORA, towers=("language",)))
+    write_run(tmp_path / "run", model)
+    with pytest.raises(UserError, match="no adapters in its vision tower: leave out that tower's base"):
+        export(tmp_path / "run", tmp_path / "out", model, bases={"vision": "a/b"})
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_of_another_size_is_refused(run, tmp_path):
     wider = dataclasses.replace(CONFIG, language=dataclasses.replace(CONFIG.language, ffn=32))
     with pytest.raises(CheckpointError, match=r"of another model: .*down.*expected"):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import train
+from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.checkpoints import CheckpointError
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig
@@ -23,6 +24,7 @@ from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.sharding import MeshConfig, make_mesh
 from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step, model_inputs
 from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
+from tests.run_folders import write_run
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -81,6 +83,19 @@ def test_a_base_of_other_sizes_names_the_fields(imported):
         CheckpointError, match=r"language.width: the config says 32, the folder 16; .*rope_theta: .* 5.0"
     ):
         start(other)
+
+
+def test_a_base_run_of_another_vocabulary_is_refused(tmp_path):
+    """Whose embedding has as many rows, but for other words."""
+    small = small_experiment(regime="full", base=str(tmp_path / "run"), mesh=MESH)
+    language = dataclasses.replace(small.model.language, vocab_size=suite_tokenizer().vocab_size)
+    model = dataclasses.replace(small.model, language=language, lora=None)
+    experiment, mesh = dataclasses.replace(small, model=model), make_mesh(MESH, jax.devices()[:1])
+    written = write_run(tmp_path / "run", model, "full")
+    with pytest.raises(UserError, match=r"base: .* was trained with another vocabulary, .*--tokenizer"):
+        train.base_variables(experiment, mesh)
+    params = train.base_variables(dataclasses.replace(experiment, tokenizer=str(tmp_path / "run")), mesh)["params"]
+    np.testing.assert_array_equal(params["language"]["embedding"], written["params"]["language"]["embedding"])
 
 
 def test_adapters_of_the_base_need_adapters_in_the_config(tmp_path):

@@ -1,5 +1,6 @@
 """Checkpoints as their authors published them, against PyTorch (tests/golden/original.py wrote both)."""
 
+import io
 import json
 import os
 import pickle
@@ -57,6 +58,7 @@ def test_metas_llama_computes_what_it_should():
     """Meta rotates neighbouring numbers of a head, the model halves."""
     tower = read_language(LLAMA)
     assert tower.unused == ("rope.freqs",)
+    assert tower.notes == ("rope.freqs differs from what params.json says, which alone is used, as in Meta's code",)
     model, tokens = Llama(ModelConfig(language=tower.config)), jnp.asarray(OUTPUTS["tokens"])[None]
     positions = jnp.arange(tokens.shape[1])[None]
 
@@ -177,6 +179,9 @@ def renamed(name, content):
         (lambda f: shutil.copy(ADAPTER, f), r"00.pth: wrong architecture: tok_embeddings.weight is missing"),
         (lambda f: f.with_name("params.json").write_text("{"), r"params.json: not JSON"),
         (lambda f: change_params(f, dim=24), r"00.pth: tok_embeddings.weight: expected shape \(21, 24\) .* \(21, 16\)"),
+        (lambda f: change_params(f, moe_args={"experts": 8}), r"params.json: .*found moe_args: \{'experts': 8\}"),
+        (lambda f: change_params(f, use_scaled_rope="no"), r"use_scaled_rope: expected true or false, found 'no'"),
+        (lambda f: change_params(f, vocab_size=22), r"params.json: vocab_size: only 21 is supported, found 22"),
         (lambda f: change_params(f, n_layers=1), r"no place in this architecture for: layers.1."),
     ],
 )
@@ -199,6 +204,62 @@ def test_a_pytorch_file_cut_anywhere_is_an_error(copied):
         file.write_bytes(content[:keep])
         with pytest.raises(WeightsError, match=r"adapter\.pth"):
             list_tensors(file)
+
+
+class Rebuilt:
+    """An array that is pickled as PyTorch pickles a tensor; `write_tensors` puts PyTorch's name in place of mkdir."""
+
+    def __init__(self, key: str, array: np.ndarray):
+        self.key, self.array = key, array
+
+    def __reduce__(self):
+        strides = tuple(step // self.array.itemsize for step in self.array.strides)
+        return os.mkdir, (Storage(self.key, self.array), 0, self.array.shape, strides)
+
+
+class Storage:
+    def __init__(self, key: str, array: np.ndarray):
+        kind = {"float32": "FloatStorage", "float16": "HalfStorage", "bfloat16": "BFloat16Storage"}[str(array.dtype)]
+        self.persistent_id = ("storage", kind, key, "cpu", array.size)
+
+
+class TensorPickler(pickle.Pickler):
+    def persistent_id(self, obj):
+        return getattr(obj, "persistent_id", None) if isinstance(obj, Storage) else None
+
+
+def write_tensors(file: Path, tensors: dict[str, np.ndarray]) -> Path:
+    """A PyTorch file, as far as the reader looks."""
+    stream = io.BytesIO()
+    TensorPickler(stream, 2).dump({name: Rebuilt(str(i), array) for i, (name, array) in enumerate(tensors.items())})
+    write_torch_file(file, stream.getvalue().replace(b"posix\nmkdir", b"torch._utils\n_rebuild_tensor_v2"))
+    with zipfile.ZipFile(file, "a") as archive:
+        for i, array in enumerate(tensors.values()):
+            archive.writestr(f"archive/data/{i}", np.ascontiguousarray(array).tobytes())
+    return file
+
+
+@pytest.mark.parametrize(
+    "changed", [None, "llama.layers.1.attention.wq.weight", "llama.output.weight", "clip.visual.conv1.weight"]
+)
+def test_weights_that_an_adapters_file_repeats_are_compared(tmp_path, changed):
+    """A whole model may be in it, in another kind of number; but not another model."""
+    llama, clip, adapter = (list_tensors(file) for file in (LLAMA / "consolidated.00.pth", CLIP, ADAPTER))
+    tensors = {key.removeprefix("model."): tensor.read() for key, tensor in adapter.items() if key.startswith("model.")}
+    repeated = {f"llama.{key}": tensor.read() for key, tensor in llama.items() if len(tensor.shape) > 1}
+    repeated |= {f"clip.{key}": tensor.read() for key, tensor in clip.items() if key.startswith("visual.")}
+    if changed is not None:
+        repeated[changed] = repeated[changed].copy()
+        repeated[changed].flat[-1] += 0.5
+    repeated = {key: values.astype(np.float32 if "clip" in key else jnp.bfloat16) for key, values in repeated.items()}
+    file = write_tensors(tmp_path / "whole.pth", tensors | repeated)
+    if changed is None:
+        towers = import_backbones(LLAMA, tmp_path / "out", CLIP, adapter=file, adapter_heads=3)
+        np.testing.assert_array_equal(towers["language"].load()["output"], read_language(LLAMA).load()["output"])
+        return
+    with pytest.raises(WeightsError, match=f"whole.pth: {changed}: not the "):
+        import_backbones(LLAMA, tmp_path / "out", CLIP, adapter=file, adapter_heads=3)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,21 @@ import jax
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.encoding.text import WordTokenizer
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policy import BATCH_SIZES, Policy, full_size, load, save_policy_config
+from dsvla_jax.policy import (
+    BATCH_SIZES,
+    Policy,
+    PolicyConfig,
+    full_size,
+    load,
+    load_policy_config,
+    load_vocabulary,
+    save_policy_config,
+)
 from dsvla_jax.types import Camera, Observation
 from tests.run_folders import MESHES, MODEL, write_run
 from tests.serving import PROMPTS, observation, tiny_policy
@@ -60,6 +71,39 @@ def test_few_sizes_are_compiled():
     assert all(full_size(size) == size for size in BATCH_SIZES)
     assert len({full_size(size) for size in range(1, 129)}) == len(BATCH_SIZES)
     assert [full_size(size) for size in (3, 20, 129, 300)] == [4, 25, 256, 384]
+
+
+def words_run(tmp_path: Path, padding: int = 0) -> tuple[PolicyConfig, tuple[str, ...]]:
+    """A run folder without checkpoints: what it says of itself, and its vocabulary's words."""
+    config, tokenizer = tiny_policy().config, tiny_policy().tokenizer
+    assert isinstance(tokenizer, WordTokenizer)
+    language = dataclasses.replace(config.model.language, vocab_size=tokenizer.vocab_size + padding)
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, language=language))
+    save_policy_config(tmp_path, config, tokenizer)
+    return load_policy_config(tmp_path), tokenizer.words
+
+
+def test_a_run_folder_with_its_own_vocabulary_is_read(tmp_path):
+    config, words = words_run(tmp_path, padding=9)
+    assert load_vocabulary(tmp_path, config) == WordTokenizer(words)
+
+
+@pytest.mark.parametrize("change", [lambda w: (*w, "zebra"), lambda w: w[:-29], lambda w: w[::-1]])
+def test_a_run_folder_with_another_vocabulary_is_refused(tmp_path, change):
+    """It has rows enough for one word more, and for fewer, and the right number in another order."""
+    config, words = words_run(tmp_path, padding=9)
+    save_tokenizer(WordTokenizer(change(words)), tmp_path)
+    with pytest.raises(CheckpointError, match="its tokenizer files are not those that it was trained with"):
+        load(tmp_path)
+    # A run from before the digest was written has its size alone to compare.
+    older = dataclasses.replace(config, vocabulary=None)
+    if len(change(words)) > len(words):
+        rows = dataclasses.replace(config.model.language, vocab_size=config.model.language.vocab_size - 9)
+        older = dataclasses.replace(older, model=dataclasses.replace(config.model, language=rows))
+        with pytest.raises(CheckpointError, match="tokens for an embedding of"):
+            load_vocabulary(tmp_path, older)
+    else:
+        load_vocabulary(tmp_path, older)
 
 
 def test_a_run_folder_keeps_the_tokenizer(policy, tmp_path):

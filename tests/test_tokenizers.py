@@ -13,7 +13,7 @@ from tokenizers import Tokenizer
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.encode import encode_text
 from dsvla_jax.encoding.grammar import SEPARATOR, build_answer_grammar
-from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer, save_tokenizer, vocabulary_digest
 from dsvla_jax.encoding.prompts import Slot, answer_pieces, format_answer, format_prompt, parse_answer
 from dsvla_jax.encoding.text import WordTokenizer
 from dsvla_jax.errors import UserError
@@ -37,6 +37,7 @@ def test_a_tokenizer_survives_its_folder(kind, tmp_path):
     copy = load_tokenizer(tmp_path / "copy")
     assert copy == tokenizer
     assert hash(copy) == hash(tokenizer)
+    assert vocabulary_digest(copy) == vocabulary_digest(tokenizer)
     for one in (copy, pickle.loads(pickle.dumps(copy))):
         assert (one.bos_id, one.eos_id, one.pad_id, one.vocab_size) == (
             tokenizer.bos_id,

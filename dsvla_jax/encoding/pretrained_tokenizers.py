@@ -7,6 +7,7 @@ A tokenizer's folder is that of a Hugging Face checkpoint: `tokenizer.json` (the
 
 import dataclasses
 import functools
+import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +19,8 @@ import tokenizers
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer
 from dsvla_jax.errors import UserError
 
+# Embeddings have more rows than the vocabulary has tokens where their number was rounded up, by fewer than so many.
+PADDING_ROWS = 1024
 _NAMES = ("tokenizer_config.json", "special_tokens_map.json")  # name special tokens by their text
 _NUMBERS = ("config.json", "generation_config.json")  # by their number
 
@@ -131,6 +134,20 @@ def save_tokenizer(tokenizer: Tokenizer, folder: Path) -> None:
     """Writes a folder from which `load_tokenizer` reads the same tokenizer, whatever kind it is."""
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(folder)
+
+
+def fits_rows(tokenizer: Tokenizer, rows: int) -> bool:
+    """Whether an embedding of so many rows can be of the tokenizer: one a token, and few that only fill up."""
+    return tokenizer.vocab_size <= rows < tokenizer.vocab_size + PADDING_ROWS
+
+
+def vocabulary_digest(tokenizer: Tokenizer) -> str:
+    """SHA-256 of all that makes the tokenizer what it is: equal where the vocabulary is, on every machine."""
+    digest = hashlib.sha256(type(tokenizer).__name__.encode())
+    for field in dataclasses.fields(tokenizer):  # pyright: ignore[reportArgumentType]
+        value = getattr(tokenizer, field.name)
+        digest.update(value if isinstance(value, bytes) else json.dumps(value).encode())
+    return digest.hexdigest()
 
 
 def _load_json(folder: Path, file: Path) -> Tokenizer:

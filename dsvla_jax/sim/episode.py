@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dsvla_jax.command_line import require_usual_draws
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.sim import controller, raycast
 from dsvla_jax.sim import physics as physics_module
@@ -36,6 +37,7 @@ class Environment:
     image_size: height and width of the front camera's picture, pixels.
     num_arms: only checked against the task's, for a caller that needs a certain number.
     shifts: which of ``shifts.SHIFTS`` make the episodes unlike those of training.
+    Raises UserError where JAX's settings would draw other episodes from the same seeds.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class Environment:
         shadows: bool = True,
         shifts: Sequence[str] = (),
     ):
+        require_usual_draws()
         self.task = get_task(task) if isinstance(task, str) else task
         if num_arms is not None and num_arms != self.task.num_arms:
             raise ValueError(f"task {self.task.name!r} is for {self.task.num_arms} arm(s), not {num_arms}")

@@ -17,7 +17,7 @@ from typing import Annotated
 
 import tyro
 
-from dsvla_jax.command_line import fail_with_message, parse_options
+from dsvla_jax.command_line import fail_with_message, require_each_option_once
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.partition import MESH_AXES
 from dsvla_jax.training.chips import Slice, find_slice
@@ -148,7 +148,8 @@ def command_line(arguments: list[str]) -> int:
     ) -> int:
         return main(experiment, options)
 
-    return parse_options(plan, args=arguments[1:], prog=f"plan {arguments[0]}", description=__doc__)
+    require_each_option_once(arguments[1:])
+    return tyro.cli(plan, args=arguments[1:], prog=f"plan {arguments[0]}", description=__doc__)
 
 
 if __name__ == "__main__":

@@ -16,10 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from dsvla_jax.command_line import fail_with_message, parse_options
-from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
+from dsvla_jax.command_line import fail_with_message, require_each_option_once
 from dsvla_jax.model.config import VisualPromptConfig
-from dsvla_jax.policy import load_policy_config
+from dsvla_jax.policy import load_policy_config, load_vocabulary
 from dsvla_jax.weights.base import import_backbones
 from dsvla_jax.weights.export import ExportOptions, export_run
 from dsvla_jax.weights.towers import summarize
@@ -87,7 +86,7 @@ def export_command(
     bases = {"language": language_base, "vision": vision_base}
     options = ExportOptions(merged, DTYPES[dtype], shard_gigabytes * 1e9, bases)
     config = load_policy_config(run)
-    folders = export_run(run, out, config.model, load_tokenizer(run), options)
+    folders = export_run(run, out, config.model, load_vocabulary(run, config), options)
     print(f"written: {out} ({', '.join(folders)})")
 
 
@@ -97,9 +96,13 @@ def main() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name not in commands:
         print(__doc__)
-        sys.exit(0 if name in ("", "-h", "--help") else 2)
+        if name in ("", "-h", "--help"):
+            sys.exit(0)
+        print(f"error: unknown command {name!r}: expected {' or '.join(commands)}", file=sys.stderr)
+        sys.exit(2)
     with fail_with_message():
-        parse_options(commands[name], args=sys.argv[2:], prog=f"python -m dsvla_jax.weights {name}")
+        require_each_option_once(sys.argv[2:])
+        tyro.cli(commands[name], args=sys.argv[2:], prog=f"python -m dsvla_jax.weights {name}")
 
 
 if __name__ == "__main__":

@@ -83,6 +83,8 @@ def import_backbones(
         towers["vision"] = read_vision(vision_source, image_size, projection or adapter is not None)
     if adapter is not None:
         added = read_adapter(adapter, towers["language"].config, towers["vision"].config, adapter_heads)
+        for name, tensors in added.repeated.items():
+            towers[name].require_equal(tensors, adapter)
         towers["language"] = towers["language"].replaced(added.language, added.instead, adapter)
         towers["projector"] = added.projector
         towers |= {} if added.lora is None else {"lora": added.lora}

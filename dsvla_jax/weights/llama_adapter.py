@@ -21,11 +21,18 @@ from dsvla_jax.model.config import (
     VisualPromptConfig,
 )
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.weights.original import META_BLOCKS, META_LINEAR, META_NAMES, in_rotary_pairs
+from dsvla_jax.weights.original import (
+    CLIP_NAMES,
+    META_BLOCKS,
+    META_LINEAR,
+    META_NAMES,
+    in_rotary_pairs,
+    split_in_projections,
+)
 from dsvla_jax.weights.peft_adapters import refuse_peft_adapter
 from dsvla_jax.weights.tensors import StoredTensor, WeightsError
 from dsvla_jax.weights.torch_files import list_tensors
-from dsvla_jax.weights.towers import Place, Tower, assign, find_prefix, flat_shapes
+from dsvla_jax.weights.towers import Place, Tower, assign, find_places, find_prefix, flat_shapes, tower_shapes
 
 PROJECTOR_NAMES = {
     **{
@@ -45,23 +52,28 @@ PROJECTOR_NAMES = {
     "adapter_query": "adapter_query.weight[{}]",
     "gate": "gate[{}]",
 }
+CLIP = "clip.visual."
 GATE = re.compile(r"layers\.(\d+)\.attention\.gate")
 
 
 @dataclasses.dataclass(frozen=True)
 class Adapter:
-    """What a file adds. language: the decoder's sizes with biases. instead: the norms and biases that it has for it."""
+    """What a file adds. language: the decoder's sizes with biases. instead: the norms and biases that it has for it.
+
+    repeated: by tower, what it has of the towers' own weights, which is to be equal to them.
+    """
 
     projector: Tower
     lora: Tower | None
     language: LanguageConfig
     instead: Mapping[Place, StoredTensor]
+    repeated: Mapping[str, Mapping[Place, StoredTensor]]
 
 
 def read_adapter(file: Path, language: LanguageConfig, vision: VisionConfig, heads: int) -> Adapter:
     """The trained parts in a PyTorch file for towers of these sizes. heads: of the visual blocks, which no file says.
 
-    LLaMA's and CLIP's own weights may be in the file too; they are left alone.
+    LLaMA's and CLIP's own weights may be in the file too: `Adapter.repeated`, to be compared with the towers'.
     Raises WeightsError naming file and key where anything does not fit.
     """
     refuse_peft_adapter(file)
@@ -91,7 +103,13 @@ def read_adapter(file: Path, language: LanguageConfig, vision: VisionConfig, hea
     if strange:
         raise WeightsError(f"{file}: no place in this architecture for: {', '.join(sorted(strange)[:5])}")
     projector = _projector(own, gates, language, vision, heads, file)
-    return Adapter(projector, lora, language, instead)
+    matrices = {ours: theirs for ours, theirs in META_NAMES.items() if not ours.endswith("/scale")}
+    clip = split_in_projections({key.removeprefix(CLIP): t for key, t in tensors.items() if key.startswith(CLIP)})
+    repeated = {
+        "language": find_places(matrices, tower_shapes(language), decoder),
+        "vision": find_places(CLIP_NAMES, tower_shapes(dataclasses.replace(vision, embed_width=None)), clip),
+    }
+    return Adapter(projector, lora, language, instead, repeated)
 
 
 def _unnumbered(key: str) -> str:

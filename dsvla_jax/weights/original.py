@@ -150,7 +150,7 @@ def read_openai_vision(file: Path, projection: bool = False) -> Tower:
         config,
         tower_shapes(config),
         names,
-        _split_in_projections(tensors),
+        split_in_projections(tensors),
         file,
         prefix=prefix,
         droppable=droppable,
@@ -158,7 +158,7 @@ def read_openai_vision(file: Path, projection: bool = False) -> Tower:
     )
 
 
-def _split_in_projections(tensors: Mapping[str, StoredTensor]) -> dict[str, StoredTensor]:
+def split_in_projections(tensors: Mapping[str, StoredTensor]) -> dict[str, StoredTensor]:
     """Each matrix and bias that makes queries, keys and values as three tensors."""
     split: dict[str, StoredTensor] = {}
     for key, tensor in tensors.items():

@@ -100,6 +100,18 @@ class Tower:
         )
         return dataclasses.replace(self, config=config, shapes=shapes, pieces=pieces)
 
+    def require_equal(self, tensors: Mapping[Place, StoredTensor], source: Path) -> None:
+        """Raises WeightsError where another file's tensors are not those at the same places, but for their rounding."""
+        for piece in self.pieces:
+            other = tensors.get(piece.place)
+            if piece.place[0] in self.computed or other is None:
+                continue
+            if not piece.tensor.equals(other, rounded=True):
+                raise WeightsError(
+                    f"{source}: {other.key}: not the {piece.tensor.key} of {piece.tensor.file}: it was trained with "
+                    "another model, or trained that one's weights too; name as the source the model that it belongs to"
+                )
+
     def load(self, dtype: Any = np.float32) -> dict[str, Any]:
         """Its parameters in memory, a nested dict."""
         arrays = {path: np.empty(shape, dtype) for path, shape in self.shapes.items()}
@@ -143,6 +155,14 @@ def assign(
         raise WeightsError(f"{source}: its tensors do not fit its sizes: {'; '.join(problems)}")
     pieces = tuple(_piece(place, tensors[key], shapes, axes) for place, key in keys.items())
     return Tower(config, shapes, pieces, unused, notes)
+
+
+def find_places(
+    names: Mapping[str, str], shapes: Mapping[str, tuple[int, ...]], tensors: Mapping[str, StoredTensor]
+) -> dict[Place, StoredTensor]:
+    """Those of the tensors that are parameters of ``shapes`` by their names (see `assign`)."""
+    keys = {place: names[place[0]].format(place[1]) for place in _places(shapes) if place[0] in names}
+    return {place: tensors[key] for place, key in keys.items() if key in tensors}
 
 
 def _places(shapes: Mapping[str, tuple[int, ...]]) -> Iterator[Place]:
