@@ -93,7 +93,6 @@ RULES = (
     Rule("eval.py .*--step best", "--episodes 1 --tasks lamp_on", {"RUN": "runs/validated"}),
     Rule("eval.py", "--episodes 1 --tasks lamp_on", OWN),
     Rule("data_pipelines.demos", f"--episodes 4 --tasks {TASKS}"),
-    Rule("oxe fixtures", "--episodes 4"),
     Rule("data_pipelines.find_keypoints|--perception", only_parsed="needs PyTorch and weights from a hub"),
     Rule("data_pipelines", words=OWN),
     Rule("weights import SRC", words={"OUT": "bases/mine", "FILE": "tests/golden/original/adapter.pth", **ORIGINAL}),
