@@ -34,8 +34,8 @@ from tests.accelerator_sections import platforms_expert, sections
 from tests.small import small_encoding
 
 ROOT = Path(__file__).parent.parent
-# Those that take most of the time: they train a run, and trace MJX.
-LONG = ("tiny", "mjx_lamp_on", "mjx_stack_blocks", "equal_episodes")
+# Those that take most of the time: they decode, train a run, and trace MJX.
+LONG = ("paper_7b_decode", "render", "tiny", "mjx_lamp_on", "mjx_stack_blocks", "equal_episodes")
 FIGURES = {
     "devices": ("kind", "jax", "processors", "product_tflops"),
     "paper_7b_train": (
@@ -71,8 +71,8 @@ def measure(folder: Path, names: list[str], size: str = "toy", status: int = 0) 
         "XDG_CACHE_HOME": str(folder / "cache"),
     }
     command = [sys.executable, "-m", "benchmarks.accelerator", "--size", size, "--out", str(folder / "out.json")]
-    command += ["--folder", str(folder), "--seconds", "900", "--sections", ",".join(names)]
-    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1200)
+    command += ["--folder", str(folder), "--seconds", "3000", "--sections", ",".join(names)]
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=3300)
     assert result.returncode == status, result.stdout + result.stderr
     return json.loads((folder / "out.json").read_text()), result.stdout
 
