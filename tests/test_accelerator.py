@@ -1,11 +1,13 @@
 """benchmarks/accelerator.py at toy size on a CPU, and what keeps its figures when something goes wrong."""
 
+import dataclasses
 import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,28 +16,34 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks._accelerator.paper import one_device, paper_experiment, train_batch
 from benchmarks._accelerator.report import Report, flat, table
 from benchmarks._accelerator.sections import SECTIONS, SIZES, Job, Section, choose, problem_file
-from benchmarks._accelerator.simulation import compare_pictures
+from benchmarks._accelerator.simulation import compare_pictures, starts
 from benchmarks._accelerator.worker import run_sections
 from benchmarks.accelerator import supervise
 from benchmarks.accelerator_wheels import LOCK, PACKAGES, requirements
 from data_pipelines.demos import generate_demonstrations
 from dsvla_jax.encoding.encode import cloud_tokens
+from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import front_camera
+from dsvla_jax.model.vla import VLA
+from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.kinematics import inverse_kinematics
 from dsvla_jax.sim.robot import SINGLE_BASE
 from dsvla_jax.sim.scene import build_scene
 from dsvla_jax.sim.shifts import Start, shift
 from dsvla_jax.sim.tasks import get_task
+from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.types import Observation
 from tests.accelerator_sections import platforms_expert, sections
 from tests.small import small_encoding
+from tests.vocabularies import small_tokenizer
 
 ROOT = Path(__file__).parent.parent
-# Those that take most of the time: they train a run, and trace MJX.
-LONG = ("tiny", "mjx_lamp_on", "mjx_stack_blocks", "equal_episodes")
+# Those that take most of the time: they decode, train a run, and trace MJX.
+LONG = ("paper_7b_decode", "render", "tiny", "mjx_lamp_on", "mjx_stack_blocks", "equal_episodes")
 FIGURES = {
     "devices": ("kind", "jax", "processors", "product_tflops"),
     "paper_7b_train": (
@@ -71,8 +79,8 @@ def measure(folder: Path, names: list[str], size: str = "toy", status: int = 0) 
         "XDG_CACHE_HOME": str(folder / "cache"),
     }
     command = [sys.executable, "-m", "benchmarks.accelerator", "--size", size, "--out", str(folder / "out.json")]
-    command += ["--folder", str(folder), "--seconds", "900", "--sections", ",".join(names)]
-    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1200)
+    command += ["--folder", str(folder), "--seconds", "3000", "--sections", ",".join(names)]
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=3300)
     assert result.returncode == status, result.stdout + result.stderr
     return json.loads((folder / "out.json").read_text()), result.stdout
 
@@ -113,6 +121,25 @@ def test_without_an_accelerator_the_full_size_is_refused(tmp_path: Path):
     message = "JAX has no accelerator here; on a CPU use --size toy"
     assert [section["error"] for section in report["sections"].values()] == [message] * 2
     assert printed.count(message) == 2
+
+
+@pytest.mark.slow
+def test_the_largest_programs_can_be_written_for_an_nvidia_gpu():
+    """The paper's training step, whose weights exist as shapes only, and a key pose in MJX."""
+    full = paper_experiment("full")
+    full = dataclasses.replace(full, batch_size=1, model=dataclasses.replace(full.model, attention="fused"))
+    tokenizer, optimizer = small_tokenizer("sentencepiece"), make_optimizer(full.optimizer, full.steps)
+    state, frozen = jax.eval_shape(partial(initial_state, full, None, optimizer))
+    targets = number_rows(tokenizer, full.encoding.style).targets(0.0)
+    step = jit_train_step(make_train_step(full, VLA(full.model), optimizer, targets), state, one_device(full))
+    environment, start = Environment("stack_blocks", "mjx"), starts("stack_blocks", 96, "eval", 1)
+    move = jax.tree.map(lambda x: x[:, 0], environment.expert(start))
+    for program, arguments in (
+        (step, (state, frozen, train_batch(full, tokenizer, 1))),
+        (jax.jit(environment.execute_in_mjx), (environment.mjx_model, start, move)),
+    ):
+        text = program.trace(*arguments).lower(lowering_platforms=("cuda",)).as_text()
+        assert text.count("dot_general") > 10
 
 
 def supervised(folder: Path, names: list[str], seconds: float) -> tuple[dict[str, Any], int]:

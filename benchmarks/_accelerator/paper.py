@@ -38,6 +38,8 @@ from dsvla_jax.training.state import initial_state, jit_train_step, make_optimiz
 from dsvla_jax.types import Camera, Observation
 from tests.vocabularies import INSTRUCTIONS, small_tokenizer
 
+# What variables of these names begin with; all others are random.
+CONSTANTS = {"scale": 1.0, "bias": 0.0, "gate": 0.0, "b": 0.0}
 # Seconds that another batch size is expected to take, its compiling included.
 ANOTHER = 60.0
 
@@ -110,16 +112,18 @@ def random_variables(shapes: Any, mesh: jax.sharding.Mesh) -> Any:
     keys = jax.random.split(jax.random.key(0, impl="rbg"), len(leaves))
     made: list[Any] = [None] * len(leaves)
     for number in sorted(range(len(leaves)), key=lambda number: -leaves[number][1].size):
-        path, leaf = leaves[number]
-        make = partial(random_leaf, name=path[-1].key, shape=leaf.shape, dtype=leaf.dtype)
-        made[number] = jax.jit(make, out_shardings=places[number])(keys[number])
+        (path, leaf), place = leaves[number], places[number]
+        if (name := path[-1].key) in CONSTANTS:
+            made[number] = jnp.full(leaf.shape, CONSTANTS[name], leaf.dtype, device=place)
+        else:
+            made[number] = jax.jit(random_leaf, static_argnums=(1, 2), out_shardings=place)(
+                keys[number], leaf.shape, leaf.dtype
+            )
     return structure.unflatten(made)
 
 
-def random_leaf(key: jax.Array, name: str, shape: tuple[int, ...], dtype: Any) -> jax.Array:
+def random_leaf(key: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:
     """One variable, at the scale that it begins with."""
-    if name in ("scale", "bias", "gate", "b"):
-        return jnp.full(shape, float(name == "scale"), dtype)
     scale = jnp.asarray(shape[-2] ** -0.5 if len(shape) > 1 else 1.0, dtype)
     if len(shape) == 3:
         # A layer at a time, because a generator's bits take several times the memory of what is made from them.
