@@ -318,7 +318,6 @@ def is_usable(folder: Path, entry: dict[str, Any], needed: int, digest: bool = T
 def main(options: Options) -> None:
     """Generates what the options ask for."""
     tasks = select_tasks(options.tasks)
-    require(bool(tasks), "tasks", "names of tasks, all, single_arm or dual_arm", "none")
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(Settings)}
     generate_demonstrations(options.out, tasks, options.episodes, workers=options.workers, **settings)
 

@@ -174,7 +174,7 @@ def test_options_out_of_range_are_refused(options: dict[str, Any], expected: str
 
 
 def test_the_demo_wants_one_task_and_an_episode_that_exists(tmp_path: Path):
-    with pytest.raises(UserError, match="--seed: expected 0 to"):
+    with pytest.raises(UserError, match="seed: expected at least 0"):
         DemoOptions(tmp_path, seed=-1)
     run = write_run(tmp_path / "run")
     for task in ("lamp_on,close_box", "all"):

@@ -107,10 +107,17 @@ def test_adapters_of_the_base_need_adapters_in_the_config(tmp_path):
     assert towers.projector is not None
     sizes = ModelConfig(towers.vision, towers.language, fusion="adapter", visual_prompt=towers.projector)
     model = dataclasses.replace(sizes, lora=LoraConfig())
-    small = small_experiment(regime="lora", base=str(out), mesh=MESH)
+    small, vision = small_experiment(regime="lora", base=str(out), mesh=MESH), towers.vision
+    encoding = dataclasses.replace(
+        small.encoding,
+        image_size=vision.image_size,
+        patch_size=vision.patch_size,
+        points=dataclasses.replace(small.encoding.points, width=vision.width),
+    )
     with pytest.raises(CheckpointError, match=r"model.lora.rank: the config says 16, the folder 2"):
-        start(dataclasses.replace(small, model=model))
-    state, _ = start(dataclasses.replace(small, model=dataclasses.replace(model, lora=LoraConfig(rank=2, alpha=2.0))))
+        start(dataclasses.replace(small, encoding=encoding, model=model))
+    model = dataclasses.replace(model, lora=LoraConfig(rank=2, alpha=2.0))
+    state, _ = start(dataclasses.replace(small, encoding=encoding, model=model))
     gate = load_backbones(out)["params"]["projector"]["gate"]
     assert np.abs(gate).min() > 0
     np.testing.assert_array_equal(state.trainable["params"]["projector"]["gate"], gate)
@@ -168,7 +175,9 @@ def test_eight_bit_base_trains_from_imported_weights(imported):
     _, frozen = start(experiment)
     expected = quantize(load_backbones(imported)["params"] | {"vision": {}})["language"]
     jax.tree.map(np.testing.assert_array_equal, frozen["params"]["language"], expected)
-    with pytest.raises(UserError, match=r"base_dtype: 'int8' is for frozen weights, but regime 'full'"):
+    with pytest.raises(
+        UserError, match=r"base_dtype: expected 'same' with regime 'full', .* got 'int8'; use regime 'lora'"
+    ):
         dataclasses.replace(experiment, regime="full")
 
 

@@ -265,7 +265,7 @@ def test_weights_that_an_adapters_file_repeats_are_compared(tmp_path, changed):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"adapter_heads": 5}, "width 12 must be a multiple of 2 . heads = 10"),
+        ({"adapter_heads": 5}, r"visual_prompt.width: expected a multiple of 2 \* heads = 10, got 12"),
         ({"image_size": 8}, r"adapter_query.weight: 10 rows are not those of up to 2 layers with 17 each, .* 8 pixels"),
         ({"adapter": LLAMA / "consolidated.00.pth"}, r"wrong architecture: .*adapter_query.weight, none does"),
         ({"vision_source": ADAPTER}, r"adapter.pth: wrong architecture: .*visual.class_embedding, none does"),

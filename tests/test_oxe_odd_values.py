@@ -77,7 +77,7 @@ def test_episodes_without_words_are_left_out_kept_or_refused(wordless, capsys):
 
     with pytest.raises(DataError, match="instructions: expected one an episode, got 6 of 10 without; set unlabelled"):
         load(wordless, unlabelled="refuse")
-    with pytest.raises(UserError, match="unlabelled: expected leave_out, keep or refuse, got 'drop'"):
+    with pytest.raises(UserError, match="unlabelled: expected one of leave_out, keep, refuse, got 'drop'"):
         OxeConfig(unlabelled="drop")  # pyright: ignore[reportArgumentType]
 
     prepare(config_for(wordless))

@@ -57,7 +57,7 @@ def test_tasks_and_episodes_are_those_of_the_folder(folder, capsys):
         assert choose_tasks(data_config(folder, tasks=twice)) == ("lamp_on",)
     assert EpisodeReader(folder, ["lamp_on", "lamp_on"]).num_frames == EpisodeReader(folder, ["lamp_on"]).num_frames
     for source in ("episodes", "simulator"):
-        with pytest.raises(UserError, match=r"data.tasks: expected names of tasks, or all, got none"):
+        with pytest.raises(UserError, match=r"data.tasks: expected names of tasks, got"):
             choose_tasks(data_config(folder, source=source, tasks=(",",)))
     few = data_config(folder, tasks=("lamp_on",), episodes=1)
     assert len(open_demonstrations(few, suite_tokenizer())) == 1
