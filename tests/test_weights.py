@@ -406,7 +406,7 @@ def test_a_file_cut_anywhere_is_an_error(sharded):
 def test_vision_sources_that_do_not_fit(tmp_path):
     with pytest.raises(WeightsError, match=r"expected model_type 'clip_vision_model' .* found 'llama'"):
         read_vision(GOLDEN / "llama_sharded")
-    with pytest.raises(WeightsError, match=r"image size 10 .* image_size: expected a multiple of patch_size 3, got 10"):
+    with pytest.raises(WeightsError, match=r"image size 10 .*image_size: expected a multiple of patch_size 3, got 10"):
         read_vision(GOLDEN / "clip", 10)
     folder = write_checkpoint(tmp_path / "source", CASES["odd_grid"]["config"], case_tensors("plain"))
     with pytest.raises(WeightsError, match=r"visual_projection.weight is missing"):

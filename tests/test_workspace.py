@@ -213,6 +213,7 @@ def test_a_run_is_refused_before_it_has_a_config_and_keeps_the_box_that_was_fitt
     assert 0 < fitted.encoding.workspace_low[2] < 0.01
     train.open_data(fitted, tokenizer, BatchPart(0, 1, 2))
     assert "points in the workspace (mean of 3 samples)" in capsys.readouterr().out
+    (run / "checkpoints" / "1").mkdir(parents=True)
     save_experiment(run / "config.json", fitted)
 
     # The same command resumes with the same box, though the data have grown.
