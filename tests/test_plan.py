@@ -21,7 +21,7 @@ from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.flops import model_flops, training_flops
 from dsvla_jax.training.hlo import program_cost
 from dsvla_jax.training.plan import parse_mesh
-from dsvla_jax.training.planning import roofline
+from dsvla_jax.training.planning import needed_bytes, roofline
 from dsvla_jax.training.sharding import MeshConfig
 from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step
 from tests.sharded_training import TARGETS, batches, tiny_experiment
@@ -169,6 +169,22 @@ def test_a_peak_is_known_or_not_told():
     assert peak_flops(devices("TPU v5 lite", "TPU v5 lite")) == 2 * CHIPS["v5e"].flops
     assert peak_flops(devices("TPU v5 lite", "TPU v99")) is None
     assert peak_flops(jax.devices("cpu")) is None
+
+
+@pytest.mark.parametrize(
+    ("message", "needed"),
+    [
+        ("Ran out of memory in memory space hbm. Used 20.50G of 15.75G hbm. Exceeded", 20.5 * 2**30),
+        (
+            "CompileTimeHbmOom: Ran out of memory on HBM, the total memory required for HLO temporaries (18.50G) "
+            "exceeds available HBM (15.75G). HLO module:",
+            18.5 * 2**30,
+        ),
+        ("INTERNAL: Mosaic failed to compile a kernel", None),
+    ],
+)
+def test_what_does_not_fit_is_read_from_the_compilers_error(message: str, needed: float | None):
+    assert needed_bytes(message) == needed
 
 
 @pytest.mark.skipif(importlib.util.find_spec("libtpu") is None, reason="needs the TPU compiler")

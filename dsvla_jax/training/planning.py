@@ -157,7 +157,7 @@ def _plan(
     try:
         compiled = lowered.compile()
     except jax.errors.JaxRuntimeError as error:
-        needed = _needed(str(error))
+        needed = needed_bytes(str(error))
         if needed is None:
             raise
         seconds = time.monotonic() - start
@@ -182,9 +182,9 @@ def _plan(
     )
 
 
-def _needed(message: str) -> int | None:
-    """Bytes that the TPU compiler says a program would need, from its error."""
-    found = re.search(r"Used ([\d.]+)([KMG]) of [\d.]+[KMG] hbm", message)
+def needed_bytes(message: str) -> int | None:
+    """Bytes that the TPU compiler says a program needs, from its error: of all, or of temporaries alone in newer ones."""
+    found = re.search(r"(?:Used |total memory required [^(]*\()([\d.]+)([KMG])", message)
     return int(float(found[1]) * 2 ** {"K": 10, "M": 20, "G": 30}[found[2]]) if found else None
 
 
