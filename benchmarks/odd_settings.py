@@ -1,14 +1,16 @@
-"""Every field of every config with zero, negative, huge and contradicting values: refused, or two steps (30 minutes).
+"""Every field of every config with zero, negative, huge and contradicting values: refused, or two steps (10 minutes).
 
 Usage: python -m benchmarks.odd_settings [--only model.vision --folder DIR]
 
-Each value must end in one message without a run folder, or in two steps of training. What the settings alone show is
-asked of all in this process; what passes is trained in processes of their own, whose memory is limited.
+Each value must end in one message without a run folder, or in two steps of training. What settings and shapes show is
+asked of each value alone. Those that pass are trained together, as many fields at a time as suit one another, in a
+process whose memory is limited; a group that fails is halved until the value is found.
 """
 
 import collections
 import contextlib
 import dataclasses
+import functools
 import io
 import multiprocessing
 import os
@@ -21,7 +23,6 @@ import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import tyro
 from tqdm import tqdm
@@ -34,16 +35,20 @@ from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.training.distributed import Watchdog
 from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.training.preflight import check_step
 from tests.odd_settings import OddSetting, odd_settings, toy_experiment
 
 DATASET = "utokyo_xarm_bimanual_converted_externally_to_rlds"
 # Nothing of the toy size needs more; a value that does must be refused before it is allocated.
 MEMORY = 12 * 2**30
-SECONDS = 600
-# Runs of more steps are asked to stop once they have done two.
+SECONDS = 900
+# A run of more steps is asked to stop once it has done two.
 LONG = 100
+# What the traced network does not depend on.
+NOT_TRACED = ("data.", "oxe.", "optimizer.", "validation.", "evaluation.")
 
 REFUSED, TRAINED = "refused with a message", "trained two steps"
+Group = tuple[OddSetting, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +59,6 @@ class Options:
     """Fields whose names begin so; all if empty."""
     folder: Path | None = None
     """Where runs go; a temporary folder if not given."""
-    workers: int = 1
-    """Processes that train at a time."""
 
 
 def oxe_experiment(toy: Experiment, folder: Path) -> Experiment:
@@ -73,21 +76,28 @@ def oxe_experiment(toy: Experiment, folder: Path) -> Experiment:
     )
 
 
-def from_settings_alone(experiment: Experiment, odd: OddSetting, run: Path) -> str:
-    """What becomes of a value before anything is written; empty if it passes."""
+def with_all(experiment: Experiment, group: Group) -> Experiment:
+    """The experiment with all values of a group."""
+    return functools.reduce(lambda one, odd: odd.apply(one), group, experiment)
+
+
+def from_settings(experiment: Experiment, group: Group, run: Path, traced: bool) -> str:
+    """What becomes of values before anything is written; empty if they pass. traced: whether shapes are asked too."""
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            train.prepare(odd.apply(experiment), run)
+            prepared, _, mesh, _, picture = train.prepare(with_all(experiment, group), run)
+            if traced:
+                check_step(prepared, mesh, picture)
     except UserError:
         return REFUSED
     except Exception:
-        return traceback.format_exc(limit=-1)
+        return traceback.format_exc(limit=-3)
     return ""
 
 
-def from_training(experiment: Experiment, odd: OddSetting, run: Path) -> str:
-    """What becomes of a value in a run of two steps."""
-    changed = odd.apply(experiment)
+def from_training(experiment: Experiment, group: Group, run: Path) -> str:
+    """What becomes of values in a run of two steps."""
+    changed = with_all(experiment, group)
     if changed.steps > LONG:
         threading.Thread(target=_stop_after_two_steps, args=(run,), daemon=True).start()
     try:
@@ -97,18 +107,14 @@ def from_training(experiment: Experiment, odd: OddSetting, run: Path) -> str:
         return f"a run folder, and {error}" if run.exists() else REFUSED
     except Exception:
         return traceback.format_exc(limit=-3)
-    return TRAINED if _steps_of(run) >= 2 else "no two steps"
+    return TRAINED if any((run / "checkpoints").glob("[2-9]*")) else "no two steps"
 
 
 def _stop_after_two_steps(run: Path) -> None:
-    while _steps_of(run) < 2:
+    metrics = run / "metrics.jsonl"
+    while not metrics.exists() or metrics.read_text().count('"step"') < 2:
         time.sleep(0.1)
     os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _steps_of(run: Path) -> int:
-    file = run / "metrics.jsonl"
-    return file.read_text().count('"step"') if file.exists() else 0
 
 
 def start_worker() -> None:
@@ -117,54 +123,69 @@ def start_worker() -> None:
     configure_jax()
 
 
-def train_all(jobs: list[tuple[Experiment, OddSetting, Path]], workers: int) -> list[str]:
-    """The outcome of each. A process that dies, or takes too long, is another's end only if it ran beside it."""
-    outcomes, context = [], multiprocessing.get_context("spawn")
-    for start in tqdm(range(0, len(jobs), workers), desc="training", disable=None):
-        pool = _pools.setdefault("pool", ProcessPoolExecutor(workers, context, start_worker))
-        for future in [pool.submit(from_training, *job) for job in jobs[start : start + workers]]:
-            try:
-                outcomes.append(future.result(timeout=SECONDS))
-            except Exception as error:
-                outcomes.append(f"the process ended: {error!r}")
-                _end(_pools.pop("pool", None))
-    _end(_pools.pop("pool", None))
-    return outcomes
+def groups_of(experiment: Experiment, odds: list[OddSetting], run: Path) -> list[Group]:
+    """The values in few groups: each field once in a group, and no two that contradict each other."""
+    groups: list[Group] = []
+    for odd in odds:
+        for place, group in enumerate(groups):
+            alone = odd.name not in {other.name for other in group}
+            if alone and not from_settings(experiment, (*group, odd), run, traced=False):
+                groups[place] = (*group, odd)
+                break
+        else:
+            groups.append((odd,))
+    return groups
 
 
-_pools: dict[str, Any] = {}
+def train_group(experiment: Experiment, group: Group, folder: Path, bar: tqdm) -> dict[OddSetting, str]:
+    """What becomes of each value of a group."""
+    run = Path(tempfile.mkdtemp(dir=folder)) / "run"
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker) as pool:
+        future = pool.submit(from_training, experiment, group, run)
+        try:
+            outcome = future.result(SECONDS)
+        except Exception as error:
+            outcome = f"the process ended: {error!r}"
+            for process in multiprocessing.active_children():
+                process.kill()
+    if outcome == TRAINED or len(group) == 1:
+        bar.update(len(group))
+        return dict.fromkeys(group, outcome)
+    middle = len(group) // 2
+    return train_group(experiment, group[:middle], folder, bar) | train_group(experiment, group[middle:], folder, bar)
 
 
-def _end(pool: ProcessPoolExecutor | None) -> None:
-    if pool is not None:
-        for process in (pool._processes or {}).values():
-            process.kill()
-        pool.shutdown(wait=False, cancel_futures=True)
+def outcomes_of(experiment: Experiment, odds: list[OddSetting], folder: Path) -> dict[OddSetting, str]:
+    """What becomes of each value."""
+    run = folder / "run"
+    traced = [not odd.name.startswith(NOT_TRACED) for odd in odds]
+    bar = tqdm(list(zip(odds, traced, strict=True)), desc="settings and shapes", unit="value")
+    alone = {odd: from_settings(experiment, (odd,), run, deep) for odd, deep in bar}
+    if run.exists():
+        raise UserError(f"{run}: nothing should have been written")
+    passed = [odd for odd, outcome in alone.items() if not outcome]
+    with tqdm(total=len(passed), desc="training", unit="value") as bar:
+        for group in groups_of(experiment, passed, run):
+            alone |= train_group(experiment, group, folder, bar)
+    return alone
 
 
 def main(options: Options, folder: Path) -> int:
     """Prints the figures, and each value that is neither refused nor trained. Returns the exit status."""
-    toy = toy_experiment(folder)
-    odds = [(experiment, odd) for experiment in (toy, oxe_experiment(toy, folder)) for odd in odd_settings(experiment)]
-    # Of the second experiment only what the first does not have.
-    odds = [(one, odd) for one, odd in odds if odd.name.startswith("oxe.") == (one.oxe is not None)]
-    odds = [(one, odd) for one, odd in odds if odd.name.startswith(options.only)]
-    outcomes = [from_settings_alone(one, odd, folder / "run") for one, odd in odds]
-    written = (folder / "run").exists()
-    passed = [place for place, outcome in enumerate(outcomes) if not outcome]
-    jobs = [(*odds[place], folder / f"run{place}") for place in passed]
-    for place, outcome in zip(passed, train_all(jobs, options.workers), strict=True):
-        outcomes[place] = outcome
-    for (_, odd), outcome in zip(odds, outcomes, strict=True):
+    toy, outcomes = toy_experiment(folder), {}
+    for experiment in (toy, oxe_experiment(toy, folder)):
+        # Of the second experiment only what the first does not have.
+        odds = [odd for odd in odd_settings(experiment) if odd.name.startswith("oxe.") == (experiment.oxe is not None)]
+        outcomes |= outcomes_of(experiment, [odd for odd in odds if odd.name.startswith(options.only)], folder)
+    for odd, outcome in outcomes.items():
         if outcome not in (REFUSED, TRAINED):
             print(f"{odd.name} = {odd.value!r}: {outcome}")
-    counts = collections.Counter(outcome if outcome in (REFUSED, TRAINED) else "neither" for outcome in outcomes)
-    fields = len({odd.name for _, odd in odds})
+    counts = collections.Counter(one if one in (REFUSED, TRAINED) else "neither" for one in outcomes.values())
     print(
-        f"{fields} fields, {len(odds)} values: {counts[REFUSED]} {REFUSED}, {counts[TRAINED]} {TRAINED}, "
-        f"{counts['neither']} neither (expected 0)"
+        f"{len({odd.name for odd in outcomes})} fields, {len(outcomes)} values: {counts[REFUSED]} {REFUSED}, "
+        f"{counts[TRAINED]} {TRAINED}, {counts['neither']} neither (expected 0)"
     )
-    return int(counts["neither"] > 0 or written)
+    return int(counts["neither"] > 0)
 
 
 if __name__ == "__main__":
