@@ -183,7 +183,7 @@ def _plan(
 
 
 def needed_bytes(message: str) -> int | None:
-    """Bytes that the TPU compiler says a program needs, from its error: of all, or of temporaries alone in newer ones."""
+    """Bytes that the TPU compiler says a program needs: of all of it, or in newer ones of temporaries alone."""
     found = re.search(r"(?:Used |total memory required [^(]*\()([\d.]+)([KMG])", message)
     return int(float(found[1]) * 2 ** {"K": 10, "M": 20, "G": 30}[found[2]]) if found else None
 
