@@ -21,11 +21,7 @@ import dsvla_jax.policy
 from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.errors import UserError
-from dsvla_jax.files import write_picture
-from dsvla_jax.model.decode import Decoding
-from dsvla_jax.policy import Policy
-from dsvla_jax.ranges import at_least, check_fields
-from dsvla_jax.report import (
+from dsvla_jax.evaluation.report import (
     EpisodeResult,
     film_strip,
     mark_targets,
@@ -37,12 +33,16 @@ from dsvla_jax.report import (
     write_report,
     write_results,
 )
-from dsvla_jax.rollout import Ending, run_task
-from dsvla_jax.rollout_keypoints import Keypoints, keypoint_source
+from dsvla_jax.evaluation.rollout import Ending, run_task
+from dsvla_jax.experiment import Experiment, load_experiment, require_simulated
+from dsvla_jax.files import write_picture
+from dsvla_jax.model.decode import Decoding
+from dsvla_jax.perception.simulator import Keypoints, keypoint_source
+from dsvla_jax.policy import Policy
+from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.shifts import check_shifts
 from dsvla_jax.sim.tasks import select_tasks
-from dsvla_jax.training.experiment import Experiment, load_experiment, require_simulated
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,7 +25,7 @@ from configs import config_names, get_config
 from data_pipelines.first_look import fit_workspace, look_at_demonstrations, look_at_mixture
 from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.loader import make_loader
-from data_pipelines.samples import make_sampler, make_validation_sampler, suite_tokenizer
+from data_pipelines.samples import make_sampler, make_validation_sampler
 from data_pipelines.sources import (
     choose_tasks,
     open_demonstrations,
@@ -40,20 +40,21 @@ from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
+from dsvla_jax.evaluation.rollout import Stopped, run_task
+from dsvla_jax.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.perception.simulator import keypoint_source
+from dsvla_jax.planner.preflight import check_step
 from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
 from dsvla_jax.ranges import require
-from dsvla_jax.rollout import Stopped, run_task
-from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.tasks import TASKS, select_tasks
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training import loop
 from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.training.metrics import MetricsWriter, require_wandb
-from dsvla_jax.training.preflight import check_step
 from dsvla_jax.training.profile import trace_steps
 from dsvla_jax.training.run_folder import only_one_process, remove_other_start, require_same_experiment, run_folder
 from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch

@@ -19,15 +19,15 @@ import tyro
 import dsvla_jax.policy
 from benchmarks._timing import timed
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.device_rollout import DeviceRollout, Rollout
 from dsvla_jax.encoding.prompts import format_answer
+from dsvla_jax.evaluation.device_rollout import DeviceRollout, Rollout
+from dsvla_jax.evaluation.rollout import Ending, run_episodes
+from dsvla_jax.experiment import load_experiment
+from dsvla_jax.perception.simulator import Keypoints, keypoint_source
 from dsvla_jax.policy import Policy
-from dsvla_jax.rollout import Ending, run_episodes
-from dsvla_jax.rollout_keypoints import Keypoints, keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.training.experiment import load_experiment
 from dsvla_jax.types import Array
 
 REPEATS = 3

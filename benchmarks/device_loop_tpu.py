@@ -21,15 +21,16 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from configs.paper_7b import config as paper_7b
 from dsvla_jax.command_line import fail_with_message
-from dsvla_jax.device_rollout import device_loop
 from dsvla_jax.encoding.prompt_table import instruction_tokens
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.evaluation.device_rollout import device_loop
+from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.training.chips import find_slice
-from dsvla_jax.training.sharding import MeshConfig, make_mesh
+from dsvla_jax.training.sharding import make_mesh
 
 CHIP_GIB, NO_LIBTPU = 16, 77
 

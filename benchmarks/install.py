@@ -43,9 +43,9 @@ CHECKS = (
     ("python", "-m", "data_pipelines.vocabulary", "--help"),
     ("python", "-m", "data_pipelines.find_keypoints", "--help"),
     ("python", "-m", "dsvla_jax.weights", "import", "--help"),
-    ("python", "-m", "dsvla_jax.training.plan", "own.py", "--help"),
+    ("dsvla-plan", "own.py", "--help"),
     ("python", "-m", "dsvla_jax.serving", "--help"),
-    ("python", "-m", "dsvla_jax.demo", "--help"),
+    ("python", "-m", "dsvla_jax.evaluation.demo", "--help"),
 )
 
 

@@ -64,9 +64,9 @@ def write_data(folder: Path, episodes: int, copies: int = 1) -> None:
 def ours(folder: Path, frames: int, passes: int = 1) -> dict:
     """Frames/s of our loader, and its memory after each pass."""
     from data_pipelines.oxe.loader import OxeLoader
-    from data_pipelines.samples import suite_tokenizer
     from dsvla_jax.data_config import OxeConfig
     from dsvla_jax.encoding.encode import EncodingConfig
+    from dsvla_jax.suite_vocabulary import suite_tokenizer
 
     config = OxeConfig(folder=str(folder), mixture=(NAME,), image_size=SIZE, crop=CROP, streams=1)
     encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64, use_points=False)
@@ -78,9 +78,10 @@ def demonstrations(folder: Path, frames: int, passes: int = 1) -> dict:
     """The same of the loader of demonstrations, with every variation that a config can ask for."""
     from data_pipelines.episodes import EpisodeReader
     from data_pipelines.loader import make_loader
-    from data_pipelines.samples import make_sampler, suite_tokenizer
+    from data_pipelines.samples import make_sampler
     from dsvla_jax.data_config import DataConfig
     from dsvla_jax.encoding.encode import EncodingConfig
+    from dsvla_jax.suite_vocabulary import suite_tokenizer
 
     data = DataConfig(shift_world=0.05, crop=CROP, state_jitter=0.01, colour_variation=0.2)
     encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64)

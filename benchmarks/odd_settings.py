@@ -29,13 +29,13 @@ from tqdm import tqdm
 
 import train
 from data_pipelines.oxe.fixtures import write_fixture
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment
+from dsvla_jax.planner.preflight import check_step
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
-from dsvla_jax.training.experiment import Experiment
-from dsvla_jax.training.preflight import check_step
 from tests.odd_settings import OddSetting, odd_settings, toy_experiment
 
 DATASET = "utokyo_xarm_bimanual_converted_externally_to_rlds"

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from dsvla_jax.report import compare_physics, read_results
+from dsvla_jax.evaluation.report import compare_physics, read_results
 
 
 def main(run: Path) -> int:

@@ -40,7 +40,7 @@ def compile_plans(options: Options) -> list[dict[str, Any]]:
     """The plan of each slice, in the order of `TOPOLOGIES`; each in a process of its own, as JAX starts once."""
     for topology in TOPOLOGIES:
         if topology not in read_plans(options):
-            command = [sys.executable, "-m", "dsvla_jax.training.plan", options.config, "--topology", topology]
+            command = [sys.executable, "-m", "plan", options.config, "--topology", topology]
             command += ["--examples", str(options.examples), "--no-decode", "--out", str(options.plans)]
             subprocess.run(command, check=False)
     plans = read_plans(options)

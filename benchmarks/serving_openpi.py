@@ -17,12 +17,12 @@ import tyro
 import dsvla_jax.policy
 from benchmarks._server import server_process
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.rollout import run_episodes
-from dsvla_jax.rollout_keypoints import keypoint_source
+from dsvla_jax.evaluation.rollout import run_episodes
+from dsvla_jax.experiment import load_experiment
+from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
-from dsvla_jax.training.experiment import load_experiment
 from examples.robot_client import run_episode, simulated_robot
 
 NO_CLIENT = 77

@@ -6,7 +6,7 @@ Usage: python -m benchmarks.training_outcome [RUN]
 import sys
 from pathlib import Path
 
-from dsvla_jax.report import macro_mean, print_table, read_results, success_rates
+from dsvla_jax.evaluation.report import macro_mean, print_table, read_results, success_rates
 
 
 def main(run: Path) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.experiment import Experiment
 
 
 def config_names() -> list[str]:

@@ -10,9 +10,8 @@ warm-up, no clipping. That rate was set for going on from their own checkpoint, 
 
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig
-from dsvla_jax.training.sharding import MeshConfig
 
 EPOCHS, DEMONSTRATIONS, BATCH = 10, 100, 3
 # One demonstration of each of the 26 tasks has so many key poses together (docs/tasks.md).

@@ -10,8 +10,8 @@ checkpoint is the vocabulary, and what is imported from it the base (docs/weight
 from dataclasses import replace
 
 from configs import tiny
+from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.config import LanguageConfig
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig
 
 
 def config() -> Experiment:

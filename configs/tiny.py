@@ -3,12 +3,12 @@
 What differs from the paper profile, and why, is in docs/architecture.md under "The tiny configuration".
 """
 
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
+from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 WIDTH = 128
 

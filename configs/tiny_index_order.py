@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from configs import tiny
-from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.experiment import Experiment
 
 
 def config() -> Experiment:

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 from configs import tiny
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.config import LoraConfig
-from dsvla_jax.training.experiment import Experiment
 
 
 def config() -> Experiment:

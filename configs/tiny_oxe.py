@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from configs import tiny
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.experiment import Experiment
 
 MIXTURE = (
     "bridge_dataset",

@@ -27,8 +27,8 @@ from dsvla_jax.command_line import configure_jax, ended_by_sigterm, fail_with_me
 from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.files import hold_folder
+from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.ranges import Range, at_least, check_fields, require
-from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys

@@ -22,7 +22,7 @@ from dsvla_jax.files import hold_folder, write_picture
 from dsvla_jax.perception.grounding import GroundingOptions
 from dsvla_jax.perception.keypoints import KeypointsNotFound, Segmenter, Sighting, draw_sightings, find_keypoints
 from dsvla_jax.perception.phrases import ObjectPhrases, phrases_for
-from dsvla_jax.rollout_keypoints import suite_phrases
+from dsvla_jax.perception.simulator import suite_phrases
 from dsvla_jax.types import Camera
 
 

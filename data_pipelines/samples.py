@@ -11,7 +11,6 @@ rotation which choice it is (`encoding.number_targets`), and is 0 elsewhere.
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from functools import cache
 
 import numpy as np
 
@@ -21,16 +20,9 @@ from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer
-from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
-from dsvla_jax.sim.tasks import TASKS
+from dsvla_jax.encoding.text import Tokenizer
 
 Sample = dict[str, np.ndarray]
-
-
-@cache
-def suite_tokenizer() -> WordTokenizer:
-    """The word-level vocabulary of every instruction of the task suite."""
-    return WordTokenizer(vocabulary(text for task in TASKS.values() for text in task.all_instructions()))
 
 
 def make_sampler(

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
 from dsvla_jax.observation_checks import MAX_DEPTH
-from dsvla_jax.rollout_keypoints import keypoint_source
+from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.serving.client import PolicyClient
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys

@@ -12,8 +12,8 @@ from data_pipelines.episodes import write_episodes
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.experiment import Experiment, ValidationConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig, RopeScaling, VisualPromptConfig
-from dsvla_jax.training.experiment import Experiment, ValidationConfig
 from tests.small import small_encoding, small_language, small_vision
 from tests.test_data import random_episode
 

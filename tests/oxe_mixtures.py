@@ -2,10 +2,10 @@
 
 from data_pipelines.oxe.fixtures import known_episodes, write_fixture
 from data_pipelines.oxe.loader import OxeLoader
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.prompts import parse_answer
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 FIVE = ("nyu_rot_dataset_converted_externally_to_rlds=3", "austin_sirius_dataset_converted_externally_to_rlds",
         "cmu_play_fusion=0.5", "utokyo_pr2_opening_fridge_converted_externally_to_rlds=2",

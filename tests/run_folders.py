@@ -15,12 +15,13 @@ from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
-from dsvla_jax.training.sharding import MeshConfig, make_mesh
+from dsvla_jax.training.sharding import make_mesh
 from tests.small import small_language, small_vision
 
 TOKENIZER = WordTokenizer(vocabulary(["close the box", "stack 2 red blocks"]))

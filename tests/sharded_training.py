@@ -23,12 +23,12 @@ from jax.experimental import multihost_utils
 
 from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.encoding.number_targets import NumberTargets
+from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.vla import VLA
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig
 from dsvla_jax.training.loop import arrays_of, state_of
-from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh, put_batch
+from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
 from tests.small import small_encoding, small_language, small_vision

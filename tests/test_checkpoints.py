@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.experiment import OptimizerConfig
 from dsvla_jax.model.variables import join_variables, split_variables
-from dsvla_jax.training.experiment import OptimizerConfig
 from dsvla_jax.training.loop import arrays_of, state_of
 from dsvla_jax.training.state import TrainState, make_optimizer, start_state
 

@@ -12,16 +12,17 @@ import pytest
 import configs
 from configs import config_names, get_config
 from data_pipelines.episodes import Frame
-from data_pipelines.samples import make_sampler, suite_tokenizer
+from data_pipelines.samples import make_sampler
 from dsvla_jax.encoding.encode import build_prompt, encode_text
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.sim.tasks import TASKS
-from dsvla_jax.training.experiment import Experiment
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.state import make_optimizer, make_train_step, model_inputs, start_state
 
 # row: (3D spatial constraint, 3D tokens, aligned positional embeddings)

@@ -6,7 +6,7 @@ import cv2
 import jax
 import numpy as np
 
-from dsvla_jax.demo import NUMBERS, SHOWN, describe, draw_tokens
+from dsvla_jax.evaluation.demo import NUMBERS, SHOWN, describe, draw_tokens
 from dsvla_jax.serving.requests import Expected, parse_request
 from tests.serving import SIZE, observation, tiny_policy
 

@@ -10,19 +10,19 @@ import jax
 import pytest
 
 import eval as program
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.command_line import require_each_option_once
 from dsvla_jax.data_config import DataConfig, OxeConfig
-from dsvla_jax.demo import Options as DemoOptions
-from dsvla_jax.demo import main as demo
 from dsvla_jax.errors import UserError
+from dsvla_jax.evaluation.demo import Options as DemoOptions
+from dsvla_jax.evaluation.demo import main as demo
+from dsvla_jax.evaluation.report import EpisodeResult, read_results, write_results
+from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
-from dsvla_jax.report import EpisodeResult, read_results, write_results
 from dsvla_jax.sim.tasks import select_tasks
-from dsvla_jax.training.experiment import Experiment, save_experiment
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from tests.small import small_encoding, small_language, small_vision
 from train import advice
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import train
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.checkpoints import CheckpointError
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment, MeshConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.layers import REMAT_POLICIES
 from dsvla_jax.model.llama import rotary_tables
@@ -20,8 +20,8 @@ from dsvla_jax.model.lora import merge_lora
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.quantize import dequantize, quantize, quantize_kernel
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.experiment import Experiment
-from dsvla_jax.training.sharding import MeshConfig, make_mesh
+from dsvla_jax.suite_vocabulary import suite_tokenizer
+from dsvla_jax.training.sharding import make_mesh
 from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step, model_inputs
 from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
 from tests.run_folders import write_run

@@ -15,10 +15,10 @@ from data_pipelines.oxe.fixtures import known_episodes, write_fixture
 from data_pipelines.oxe.fixtures_converted import camera_from_world
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.rlds.writing import encode_image, write_build
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 NYU = "nyu_rot_dataset_converted_externally_to_rlds"
 TWO_ARMS = "utokyo_xarm_bimanual_converted_externally_to_rlds"

@@ -16,10 +16,10 @@ import pytest
 
 from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training import loop
-from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.metrics import MetricsWriter, rewind
 from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step, start_state
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment

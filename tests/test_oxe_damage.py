@@ -16,10 +16,10 @@ from data_pipelines.oxe.registry import get_dataset
 from data_pipelines.oxe.targets import make_targets
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.tfrecord import write_records
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 EPISODES, STEPS = 6, 6  # in two shards
 ENCODING = EncodingConfig(image_size=32, patch_size=16, style="compact", max_text_length=64, use_points=False)

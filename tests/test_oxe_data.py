@@ -14,13 +14,13 @@ from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import get_dataset
 from data_pipelines.oxe.targets import key_frames, make_targets
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.errors import UserError
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from tests.oxe_mixtures import (
     ENCODING,
     FIVE,

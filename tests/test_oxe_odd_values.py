@@ -15,12 +15,12 @@ from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.oxe.targets import key_frames
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.writing import write_build
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 BRIDGE, EPISODES, STEPS = "bridge_dataset", 10, 8
 ENCODING = EncodingConfig(image_size=32, patch_size=16, style="compact", max_text_length=64, use_points=False)

@@ -22,7 +22,7 @@ from dsvla_jax.perception.keypoints import (
     locate,
 )
 from dsvla_jax.perception.phrases import ObjectPhrases, load_table, phrases_for
-from dsvla_jax.rollout_keypoints import suite_phrases
+from dsvla_jax.perception.simulator import suite_phrases
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.objects import object_geoms, object_masks
 from dsvla_jax.sim.seeds import episode_keys

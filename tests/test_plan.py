@@ -15,14 +15,13 @@ import jax.numpy as jnp
 import pytest
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment, MeshConfig
 from dsvla_jax.model.vla import VLA
+from dsvla_jax.planner.hlo import program_cost
+from dsvla_jax.planner.meshes import parse_mesh
+from dsvla_jax.planner.planning import needed_bytes, roofline
 from dsvla_jax.training.chips import CHIPS, find_slice, peak_flops
-from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.flops import model_flops, training_flops
-from dsvla_jax.training.hlo import program_cost
-from dsvla_jax.training.plan import parse_mesh
-from dsvla_jax.training.planning import needed_bytes, roofline
-from dsvla_jax.training.sharding import MeshConfig
 from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step
 from tests.sharded_training import TARGETS, batches, tiny_experiment
 from tests.test_sharding import ROOT
@@ -217,12 +216,12 @@ def test_a_slice_that_is_none_is_an_error_with_an_example(name):
 
 @pytest.mark.slow
 def test_the_planner_plans_on_virtual_devices():
-    command = [sys.executable, "-m", "dsvla_jax.training.plan", "configs/tiny_lora.py", "--topology", "v5e:2x2"]
+    command = [sys.executable, "plan.py", "configs/tiny_lora.py", "--topology", "v5e:2x2"]
     # Without site packages' libtpu there are virtual CPU devices.
     hide = (
         "import importlib.util as u; f = u.find_spec; u.find_spec = lambda n, *a: None if n == 'libtpu' else f(n, *a)"
     )
-    run = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_module('dsvla_jax.training.plan', run_name='__main__')"
+    run = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_path('plan.py', run_name='__main__')"
     command = [sys.executable, "-c", f"{hide}; {run}", *command[2:], "--mesh", "fsdp=-1", "--examples", "2"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert result.returncode == 0, result.stderr

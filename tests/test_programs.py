@@ -11,7 +11,7 @@ import pytest
 
 from configs import get_config
 from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
-from dsvla_jax.training.experiment import save_experiment
+from dsvla_jax.experiment import save_experiment
 from tests.rlbench_files import write_dataset
 
 ROOT = Path(__file__).parent.parent

@@ -13,8 +13,7 @@ import scipy.stats
 from rich.console import Console
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.geometry.cameras import front_camera, project
-from dsvla_jax.report import (
+from dsvla_jax.evaluation.report import (
     EpisodeResult,
     checkpoints_of,
     compare_physics,
@@ -29,7 +28,8 @@ from dsvla_jax.report import (
     write_report,
     write_results,
 )
-from dsvla_jax.statistics import wilson_interval
+from dsvla_jax.evaluation.statistics import wilson_interval
+from dsvla_jax.geometry.cameras import front_camera, project
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(8, 10), (0, 10), (50, 100), (25, 25), (1, 3)])

@@ -20,7 +20,7 @@ from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.geometry.cameras import front_camera, unproject
 from dsvla_jax.perception.keypoints import Sighting
-from dsvla_jax.rollout_keypoints import suite_phrases
+from dsvla_jax.perception.simulator import suite_phrases
 from dsvla_jax.serving.batching import answer_batch
 from dsvla_jax.serving.client import ConnectionFailed, PolicyClient, ServerError
 from dsvla_jax.serving.messages import MAX_CONTAINERS, MessageError, pack, unpack

@@ -18,12 +18,12 @@ from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.command_line import parse_options
 from dsvla_jax.data_config import DataConfig, LearnedFrom, OxeConfig
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import save_experiment
+from dsvla_jax.perception.simulator import SegmentationKeypoints
 from dsvla_jax.policy import load_policy_config, save_policy_config
-from dsvla_jax.rollout_keypoints import SegmentationKeypoints
 from dsvla_jax.serving.__main__ import Options, build_server
 from dsvla_jax.serving.requests import Expected, parse_request
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.training.experiment import save_experiment
 from examples.robot_client import simulated_robot
 from tests import rlbench_files as files
 from tests.serving import tiny_policy

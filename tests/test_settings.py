@@ -13,18 +13,18 @@ import pytest
 
 import train
 from configs import config_names, get_config
-from data_pipelines.samples import suite_tokenizer
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.model.config import LoraConfig, RopeScaling, VisionConfig
+from dsvla_jax.planner.preflight import check_step
 from dsvla_jax.policy import PolicyConfig, load_policy_config, save_policy_config
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
-from dsvla_jax.training.preflight import check_step
 from dsvla_jax.training.run_folder import require_same_experiment, run_folder
-from dsvla_jax.training.sharding import MeshConfig, make_mesh
+from dsvla_jax.training.sharding import make_mesh
 from tests.odd_settings import OddSetting, odd_settings, toy_experiment
 
 

@@ -20,10 +20,11 @@ from jax.sharding import AbstractMesh
 
 from configs import get_config
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.partition import MESH_AXES, shardings
 from dsvla_jax.model.variables import join_variables, narrow_frozen, split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.sharding import MeshConfig, batch_part, make_mesh, part_of_process
+from dsvla_jax.training.sharding import batch_part, make_mesh, part_of_process
 from dsvla_jax.training.state import initial_state, make_optimizer, model_inputs
 from tests.sharded_training import batches, tiny_experiment
 

@@ -12,7 +12,7 @@ import pytest
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.loader import make_loader
 from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
-from data_pipelines.samples import make_sampler, suite_tokenizer
+from data_pipelines.samples import make_sampler
 from data_pipelines.sources import choose_tasks, open_demonstrations
 from data_pipelines.vocabulary import write_vocabulary
 from dsvla_jax.data_config import DataConfig
@@ -20,10 +20,11 @@ from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests import rlbench_files as files
 from tests.small import small_encoding, small_language, small_vision

@@ -14,10 +14,10 @@ from dsvla_jax.encoding.number_targets import NumberTargets, number_rows
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests.small import small_encoding, small_language, small_vision

@@ -13,7 +13,7 @@ import pytest
 
 import train
 from data_pipelines.episodes import EpisodeReader, write_episodes
-from data_pipelines.samples import make_validation_sampler, suite_tokenizer
+from data_pipelines.samples import make_validation_sampler
 from data_pipelines.sources import open_held_out
 from dsvla_jax.checkpoints import RunCheckpoints
 from dsvla_jax.data_config import DataConfig, OxeConfig
@@ -24,9 +24,10 @@ from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment, OptimizerConfig, ValidationConfig
 from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig, ValidationConfig
 from dsvla_jax.training.validation import guess_integers, number_errors
 from tests.small import small_encoding, small_language, small_vision
 from tests.test_data import random_episode

@@ -26,15 +26,15 @@ from data_pipelines.recording import Recording, make_demonstration
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.tfrecord import write_records
 from data_pipelines.rlds.writing import encode_image
-from data_pipelines.samples import suite_tokenizer
 from data_pipelines.workspace import View, count_points, fit_box, require_points
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.observation_checks import MIN_WORKSPACE_SHARE
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
-from dsvla_jax.training.experiment import Experiment, save_experiment
 from dsvla_jax.training.sharding import BatchPart
 from tests import rlbench_files as files
 from tests.small import small_encoding, small_language, small_vision

@@ -13,8 +13,9 @@ import jax
 import numpy as np
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.training.distributed import Watchdog, start_processes
-from dsvla_jax.training.sharding import MeshConfig, make_mesh, put_batch
+from dsvla_jax.training.sharding import make_mesh, put_batch
 
 
 def main(folder: Path, how: str) -> None:

@@ -23,16 +23,16 @@ from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import join_variables
 from dsvla_jax.model.vla import VLA
+from dsvla_jax.planner.planning import held_bytes, peak_bytes
 from dsvla_jax.policy import Policy, PolicyConfig
 from dsvla_jax.training.chips import peak_flops
-from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.flops import model_flops, prefill_flops
-from dsvla_jax.training.planning import held_bytes, peak_bytes
 from dsvla_jax.training.sharding import make_mesh, put_batch
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step, start_state
 from dsvla_jax.types import Camera, Observation

@@ -18,10 +18,10 @@ from benchmarks._accelerator.sections import SIZES, Sizes, prepared_file, proble
 from benchmarks._accelerator.simulation import EPISODE_TASK, starts
 from benchmarks._accelerator.tiny import demonstrations
 from benchmarks.mjx_agreement import outcomes
-from data_pipelines.samples import suite_tokenizer
 from data_pipelines.sources import open_demonstrations
 from dsvla_jax.command_line import configure_jax
 from dsvla_jax.sim.episode import Environment
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 # Metres an axis by which key poses are missed at most, so that not all episodes succeed.
 MISS = 0.04

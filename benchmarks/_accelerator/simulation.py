@@ -18,14 +18,14 @@ from benchmarks._timing import call, timed
 from benchmarks.device_loop import first_keypoints
 from benchmarks.mjx_agreement import outcomes
 from configs import get_config
-from data_pipelines.samples import suite_tokenizer
-from dsvla_jax.device_rollout import DeviceRollout
+from dsvla_jax.evaluation.device_rollout import DeviceRollout
+from dsvla_jax.experiment import Experiment, load_experiment
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import Policy, PolicyConfig
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.training.experiment import Experiment, load_experiment
+from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 # Different starts; larger batches repeat them.
 STARTS = 64

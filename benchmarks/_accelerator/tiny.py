@@ -13,8 +13,8 @@ import train
 from benchmarks._accelerator.sections import Job, Size
 from configs import get_config
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.report import macro_mean, read_results, success_rates
-from dsvla_jax.training.experiment import Experiment, load_experiment
+from dsvla_jax.evaluation.report import macro_mean, read_results, success_rates
+from dsvla_jax.experiment import Experiment, load_experiment
 
 # The smallest options that have every part.
 _TOY_DATA: dict[str, Any] = {"tasks": ("lamp_on",), "episodes": 2, "image_size": 32}

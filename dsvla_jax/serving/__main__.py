@@ -17,13 +17,13 @@ from dsvla_jax import policy as policies
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import load_experiment
 from dsvla_jax.perception.grounding import GroundingOptions
+from dsvla_jax.perception.simulator import suite_phrases
 from dsvla_jax.policy import PolicyConfig
 from dsvla_jax.ranges import at_least, check_fields
-from dsvla_jax.rollout_keypoints import suite_phrases
 from dsvla_jax.serving.server import Limits, Perception, PolicyServer
 from dsvla_jax.sim.tasks import get_task, select_tasks
-from dsvla_jax.training.experiment import load_experiment
 
 log = logging.getLogger("dsvla_jax.serving")
 

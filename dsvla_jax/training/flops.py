@@ -11,8 +11,8 @@ before the first weight that learns (patches) has a forward pass only.
 import dataclasses
 from typing import Literal
 
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.config import LoraConfig, ModelConfig
-from dsvla_jax.training.experiment import Experiment
 
 # Passes over a product: of the blocks, computed again or not, and of what stands outside of them.
 Passes = Literal["training", "inference"]

@@ -12,8 +12,8 @@ import numpy as np
 from tqdm import tqdm
 
 from dsvla_jax.checkpoints import Restored, RunCheckpoints
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.training.chips import peak_flops
-from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.flops import model_flops
 from dsvla_jax.training.health import Clock, SkippedSteps, memory
 from dsvla_jax.training.metrics import MetricsWriter

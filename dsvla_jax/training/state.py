@@ -12,10 +12,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.encoding.encode import EncodingConfig, encode_observation
 from dsvla_jax.encoding.number_targets import NumberTargets
+from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.partition import constrain, shardings
 from dsvla_jax.model.variables import Variables, join_variables, narrow_frozen, split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.experiment import Experiment, OptimizerConfig
 from dsvla_jax.training.objective import answer_counts, answer_loss
 from dsvla_jax.types import Array, Camera, ModelInputs, Observation
 

@@ -16,11 +16,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
 from dsvla_jax.encoding.number_targets import NumberTargets
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.geometry.rotations import rotation_distance
 from dsvla_jax.model.partition import constrain
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA
-from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.training.sharding import put_batch
 from dsvla_jax.training.state import model_inputs

@@ -17,14 +17,14 @@ from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.decode import decode_actions
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import join_variables
 from dsvla_jax.model.vla import VLA
+from dsvla_jax.planner.hlo import program_cost
 from dsvla_jax.training.chips import Chip, Slice
-from dsvla_jax.training.experiment import Experiment
 from dsvla_jax.training.flops import prefill_flops, training_flops
-from dsvla_jax.training.hlo import program_cost
 from dsvla_jax.training.sharding import batch_part, batch_sharding, make_mesh
 from dsvla_jax.training.state import (
     initial_state,

@@ -18,8 +18,8 @@ from rich.table import Table
 from rich.text import Text
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.evaluation.statistics import wilson_interval
 from dsvla_jax.geometry.cameras import project
-from dsvla_jax.statistics import wilson_interval
 from dsvla_jax.types import Camera
 
 MAX_STRIP_FRAMES = 10

@@ -1,4 +1,4 @@
-"""See one episode of a trained run as an HTML page: python -m dsvla_jax.demo RUN [--task lamp_on] [--out demo.html]
+"""Show one episode of a run as an HTML page: python -m dsvla_jax.evaluation.demo RUN [--task lamp_on] [--out demo.html]
 
 For each key pose: the picture with the cloud's 3D tokens and the patches they are aligned with, the keypoints, the
 prompt, the answer with how probable each number was, and where the arm went.
@@ -18,16 +18,16 @@ from dsvla_jax.command_line import configure_jax, fail_with_message, parse_optio
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.errors import UserError
+from dsvla_jax.evaluation.report import mark_targets, png_data, require_writable, write_html
+from dsvla_jax.evaluation.rollout import run_episodes
+from dsvla_jax.experiment import load_experiment, require_simulated
 from dsvla_jax.geometry.cameras import project
+from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.policy import Decision, Policy
 from dsvla_jax.ranges import at_least, check_fields
-from dsvla_jax.report import mark_targets, png_data, require_writable, write_html
-from dsvla_jax.rollout import run_episodes
-from dsvla_jax.rollout_keypoints import keypoint_source
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
-from dsvla_jax.training.experiment import load_experiment, require_simulated
 from dsvla_jax.types import Action, Observation
 
 SHOWN = 480  # pixels a side of a picture on the page
@@ -159,6 +159,6 @@ def main(options: Options) -> None:
 
 if __name__ == "__main__":
     with fail_with_message():
-        parsed = parse_options(Options, prog="python -m dsvla_jax.demo", description=__doc__)
+        parsed = parse_options(Options, prog="python -m dsvla_jax.evaluation.demo", description=__doc__)
         configure_jax()
         main(parsed)

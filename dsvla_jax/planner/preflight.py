@@ -9,10 +9,10 @@ import jax
 from jax.sharding import Mesh
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.variables import join_variables
 from dsvla_jax.model.vla import VLA
-from dsvla_jax.training.experiment import Experiment
-from dsvla_jax.training.planning import abstract_batch, abstract_state, bytes_on_a_device
+from dsvla_jax.planner.planning import abstract_batch, abstract_state, bytes_on_a_device
 from dsvla_jax.training.state import model_inputs
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,9 +11,42 @@ from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.partition import MESH_AXES
 from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.ranges import at_least, check_fields, more_than, require
-from dsvla_jax.training.sharding import MeshConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshConfig:
+    """How many devices stand along each axis of the mesh; -1, for one axis, is all that the others leave.
+
+    data: the batch is split, parameters are copied. fsdp: the batch is split, and parameters and optimizer state too.
+    tensor: the hidden width of each layer is split; keep it within a host. The default suits models that fit a device.
+    """
+
+    data: int = -1
+    fsdp: int = 1
+    tensor: int = 1
+
+    def __post_init__(self) -> None:
+        sizes = {axis: getattr(self, axis) for axis in MESH_AXES}
+        check_fields(self, "mesh", **dict.fromkeys(sizes, at_least(-1)))
+        named = ", ".join(f"{axis}={size}" for axis, size in sizes.items())
+        if list(sizes.values()).count(-1) > 1 or 0 in sizes.values():
+            raise UserError(f"mesh: expected positive sizes, and -1 (the rest) for one axis at most; got {named}")
+
+    def shape(self, devices: int) -> tuple[int, int, int]:
+        """Sizes of the axes on so many devices. Raises UserError where they do not multiply to it."""
+        sizes = [self.data, self.fsdp, self.tensor]
+        named = ", ".join(f"{axis}={size}" for axis, size in zip(MESH_AXES, sizes, strict=True))
+        known = math.prod(size for size in sizes if size != -1)
+        if devices % known or (-1 not in sizes and known != devices):
+            raise UserError(
+                f"mesh: {named} cannot be laid over {devices} devices; choose sizes with a product of {devices} "
+                "(-1 for the rest), e.g. --mesh.data -1 --mesh.fsdp 1 --mesh.tensor 1"
+            )
+        data, fsdp, tensor = (devices // known if size == -1 else size for size in sizes)
+        return data, fsdp, tensor
 
 
 @dataclasses.dataclass(frozen=True)
