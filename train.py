@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -61,6 +61,7 @@ from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_ba
 from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
+from dsvla_jax.types import Example, HeldOutExample
 from dsvla_jax.weights.base import is_imported, load_for_model, require_base
 
 
@@ -165,8 +166,8 @@ def train(
     targets = number_rows(tokenizer, experiment.encoding.style).targets(experiment.soft_target_sigma)
     compiled = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, targets), state, mesh)
 
-    def step(state: TrainState, batch: Mapping[str, np.ndarray]) -> tuple[TrainState, dict[str, Any]]:
-        return compiled(state, frozen, put_batch(dict(batch), mesh))
+    def step(state: TrainState, batch: Example[np.ndarray]) -> tuple[TrainState, dict[str, Any]]:
+        return compiled(state, frozen, put_batch(batch, mesh))
 
     sums = jit_validation(experiment, targets, mesh)
 
@@ -222,7 +223,7 @@ def open_data(
 
 def open_validation(
     experiment: Experiment, tokenizer: Tokenizer, part: BatchPart
-) -> Callable[[], Iterator[Mapping[str, np.ndarray]]]:
+) -> Callable[[], Iterator[HeldOutExample[np.ndarray]]]:
     """This process's parts of the batches to validate with, from their beginning each time: never training's stream.
     None where nothing is validated."""
     if not experiment.validate_every:
@@ -235,7 +236,7 @@ def open_validation(
     count = min(experiment.validation.batches, max(reader.num_frames // (size * part.count), 1))
     order: dict[str, Any] = {"seed": experiment.seed, "process_index": part.index, "process_count": part.count}
 
-    def batches() -> Iterator[Mapping[str, np.ndarray]]:
+    def batches() -> Iterator[HeldOutExample[np.ndarray]]:
         return itertools.islice(make_loader(reader, sample, batch_size=size, num_threads=0, **order), count)
 
     return batches

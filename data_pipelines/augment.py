@@ -6,11 +6,14 @@ something else.
 None of them changes its argument. Compose them in the ``to_sample`` that ``loader.make_loader`` takes.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
 from data_pipelines.pictures import random_box
 from data_pipelines.records import Frame
+from dsvla_jax.types import Picture
 
 
 def random_offset(
@@ -34,16 +37,15 @@ def shift_world(frame: Frame, offset: np.ndarray) -> Frame:
     offset = np.asarray(offset, np.float32)
     if offset.shape != (3,):
         raise ValueError(f"offset: expected shape (3,), got {offset.shape}; give one number an axis")
-    camera = frame["world_from_camera"].copy()
-    camera[:3, 3] += offset
-    return Frame(
-        **{
-            **frame,
-            "world_from_camera": camera,
-            "pose": _move(frame["pose"], offset),
-            "target_pose": _move(frame["target_pose"], offset),
-            "keypoint": frame["keypoint"] + offset,
-        }
+    world_from_camera = frame.picture.camera.world_from_camera.copy()
+    world_from_camera[:3, 3] += offset
+    camera = replace(frame.picture.camera, world_from_camera=world_from_camera)
+    return replace(
+        frame,
+        picture=replace(frame.picture, camera=camera),
+        robot=replace(frame.robot, pose=_move(frame.robot.pose, offset)),
+        target=replace(frame.target, pose=_move(frame.target.pose, offset)),
+        keypoint=frame.keypoint + offset,
     )
 
 
@@ -54,16 +56,16 @@ def jitter_state(frame: Frame, rng: np.random.Generator, max_offset: float, prob
     """
     if rng.random() >= probability:
         return frame
-    noise = rng.uniform(-max_offset, max_offset, (len(frame["pose"]), 3)).astype(np.float32)
-    return Frame(**{**frame, "pose": _move(frame["pose"], noise)})
+    noise = rng.uniform(-max_offset, max_offset, (len(frame.robot.pose), 3)).astype(np.float32)
+    return replace(frame, robot=replace(frame.robot, pose=_move(frame.robot.pose, noise)))
 
 
 def perturb_keypoint(frame: Frame, rng: np.random.Generator, max_offset: float, probability: float) -> Frame:
     """With `probability`, moves the keypoints by uniform noise of up to ±max_offset metres an axis."""
     if rng.random() >= probability:
         return frame
-    noise = rng.uniform(-max_offset, max_offset, frame["keypoint"].shape).astype(np.float32)
-    return Frame(**{**frame, "keypoint": frame["keypoint"] + noise})
+    noise = rng.uniform(-max_offset, max_offset, frame.keypoint.shape).astype(np.float32)
+    return replace(frame, keypoint=frame.keypoint + noise)
 
 
 def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
@@ -72,7 +74,7 @@ def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
     Colour is interpolated, depth is the nearest pixel's, and the intrinsics move along, so that every reading stays at
     its place in the world to half a pixel of the picture; poses and keypoints are in the world and stay.
     """
-    rows, columns = frame["depth"].shape
+    rows, columns = frame.picture.depth.shape
     inside = top >= 0 and left >= 0 and top + height <= rows and left + width <= columns
     if not inside or min(height, width) < 2:
         raise ValueError(f"crop: expected a window within {rows} x {columns}, got {(top, left, height, width)}")
@@ -81,22 +83,20 @@ def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
     u, v = left + np.arange(columns) * scale[0], top + np.arange(rows) * scale[1]
     across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
     nearest = np.ix_(np.rint(v).astype(int), np.rint(u).astype(int))
-    intrinsics = frame["intrinsics"].copy()
+    intrinsics = frame.picture.camera.intrinsics.copy()
     intrinsics[:2, 2] -= [left, top]
     intrinsics[:2] /= scale[:, None]
-    return Frame(
-        **{
-            **frame,
-            "rgb": cv2.remap(frame["rgb"], across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-            "depth": frame["depth"][nearest],
-            "intrinsics": intrinsics,
-        }
+    picture = Picture(
+        rgb=cv2.remap(frame.picture.rgb, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        depth=frame.picture.depth[nearest],
+        camera=replace(frame.picture.camera, intrinsics=intrinsics),
     )
+    return replace(frame, picture=picture)
 
 
 def random_crop(frame: Frame, rng: np.random.Generator, least: float) -> Frame:
     """A random window whose sides are a share of the picture's between `least` and 1; see `crop`."""
-    rows, columns = frame["depth"].shape
+    rows, columns = frame.picture.depth.shape
     return crop(frame, *random_box(rng, rows, columns, least))
 
 
@@ -107,12 +107,13 @@ def vary_colour(frame: Frame, rng: np.random.Generator, strength: float = 0.15) 
     """
     brightness, contrast, saturation = 1 + rng.uniform(-strength, strength, 3)
     hue = rng.uniform(-strength, strength) * 20
-    hsv = cv2.cvtColor(frame["rgb"].astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
+    hsv = cv2.cvtColor(frame.picture.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
     hsv[..., 0] = (hsv[..., 0] + hue) % 360
     hsv[..., 1] = np.clip(hsv[..., 1] * saturation, 0, 1)
     rgb = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB) * brightness
     rgb = (rgb - rgb.mean()) * contrast + rgb.mean()
-    return Frame(**{**frame, "rgb": np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)})
+    rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+    return replace(frame, picture=replace(frame.picture, rgb=rgb))
 
 
 def _move(poses: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -127,7 +127,7 @@ class ScriptedExpert:
         unmissed = environment.follow(start_state, plan)
         replayed = np.stack([np.asarray(environment.success(after)) for after in unmissed], axis=1)
         keypoints, unseen = self._keypoints(start_state, observations[0])
-        positions = np.stack([observation.pose[..., :3] for observation in observations], axis=1)
+        positions = np.stack([observation.robot.pose[..., :3] for observation in observations], axis=1)
         active = np.asarray(self._replay_latch(positions, keypoints))
         good = np.asarray(environment.success(state)) & ~np.asarray(state.ik_failed) & ~np.asarray(state.diverged)
         good &= ~unseen
@@ -145,12 +145,12 @@ class ScriptedExpert:
                     task=self.task.name,
                     instruction=instructions[i],
                     seed=start + i,
-                    rgb=[x.rgb for x in seen],
-                    depth=[mark_missing(x.depth) for x in seen],
-                    intrinsics=np.stack([x.camera.intrinsics for x in seen]),
-                    world_from_camera=np.stack([x.camera.world_from_camera for x in seen]),
-                    pose=np.stack([x.pose for x in seen]),
-                    gripper_open=np.stack([x.gripper_open for x in seen]),
+                    rgb=[x.picture.rgb for x in seen],
+                    depth=[mark_missing(x.picture.depth) for x in seen],
+                    intrinsics=np.stack([x.picture.camera.intrinsics for x in seen]),
+                    world_from_camera=np.stack([x.picture.camera.world_from_camera for x in seen]),
+                    pose=np.stack([x.robot.pose for x in seen]),
+                    gripper_open=np.stack([x.robot.gripper_open for x in seen]),
                     target_pose=poses[i, :frames],
                     target_gripper=grippers[i, :frames],
                     keypoints=keypoints[i],

@@ -94,21 +94,22 @@ def views_of(frames: Sequence[Frame]) -> list[tuple[str, list[View]]]:
     """What was seen, by task. Raises DataError where pictures or camera are none."""
     views: dict[str, list[View]] = {}
     for frame in frames:
-        where = f"{frame['task']}, episode {frame['episode']}, sample {frame['frame']}"
-        check_pictures(frame["rgb"], frame["depth"], where)
-        check_camera(frame["intrinsics"], frame["world_from_camera"], frame["rgb"].shape[:2], where)
-        hands = np.concatenate([frame["pose"][:, :3], frame["target_pose"][:, :3]])
-        view = View(frame["depth"], frame["intrinsics"], frame["world_from_camera"], hands)
-        views.setdefault(frame["task"], []).append(view)
+        where = f"{frame.task}, episode {frame.episode}, sample {frame.frame}"
+        picture, camera = frame.picture, frame.picture.camera
+        check_pictures(picture.rgb, picture.depth, where)
+        check_camera(camera.intrinsics, camera.world_from_camera, picture.rgb.shape[:2], where)
+        hands = np.concatenate([frame.robot.pose[:, :3], frame.target.pose[:, :3]])
+        view = View(picture.depth, camera.intrinsics, camera.world_from_camera, hands)
+        views.setdefault(frame.task, []).append(view)
     return list(views.items())
 
 
 def cloud_warnings(frames: Sequence[Frame], encoding: EncodingConfig) -> list[str]:
     """What training with 3D input would refuse of frames, one a task, for whoever only looks at them."""
     found = []
-    for task in dict.fromkeys(frame["task"] for frame in frames):
+    for task in dict.fromkeys(frame.task for frame in frames):
         try:
-            ((_, views),) = views_of([frame for frame in frames if frame["task"] == task])
+            ((_, views),) = views_of([frame for frame in frames if frame.task == task])
             require_points(task, views, encoding)
         except UserError as error:
             found.append(f"3D input: {error}")

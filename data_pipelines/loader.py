@@ -4,7 +4,7 @@ import json
 import operator
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any, Generic, SupportsIndex, TypeVar
 
 import grain
 import numpy as np
@@ -13,8 +13,7 @@ from data_pipelines.episodes import EpisodeReader
 from data_pipelines.records import Frame
 from dsvla_jax.errors import DataError
 
-Sample = dict[str, Any]
-ToSample = Callable[[Frame, np.random.Generator], Sample]
+Sample = TypeVar("Sample")
 
 
 class FrameSource(grain.sources.RandomAccessDataSource[Frame]):
@@ -33,7 +32,7 @@ class FrameSource(grain.sources.RandomAccessDataSource[Frame]):
         return f"FrameSource(tasks={self._reader.tasks}, frames={len(self)})"
 
 
-class EpisodeLoader(Iterator[Sample]):
+class EpisodeLoader(Iterator[Sample], Generic[Sample]):
     """Batches with a position that can be saved, together with what it is a position in; made by `make_loader`."""
 
     def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: dict[str, Any]):
@@ -66,15 +65,9 @@ def _summary(contents: dict[str, Any], other: dict[str, Any]) -> str:
     return ", ".join(f"{task} {n['episodes']} episodes ({n['frames']} frames)" for task, n in tasks.items()) or "none"
 
 
-def frame_arrays(frame: Frame, rng: np.random.Generator) -> Sample:
-    """The default sample: all fields of the frame as arrays, nothing random; instruction and task as text arrays."""
-    del rng
-    return {name: np.asarray(value) for name, value in frame.items()}
-
-
 def make_loader(
     reader: EpisodeReader,
-    to_sample: ToSample | None = None,
+    to_sample: Callable[[Frame, np.random.Generator], Sample],
     *,
     batch_size: int,
     seed: int,
@@ -83,11 +76,11 @@ def make_loader(
     process_index: int = 0,
     process_count: int = 1,
     num_threads: int = 2,
-) -> EpisodeLoader:
+) -> EpisodeLoader[Sample]:
     """Batches of samples; one epoch is every frame of every episode once, in an order that is new each epoch.
 
-    to_sample: (frame, generator) -> arrays of shapes that are the same for all samples. The generator depends only on
-    `seed` and the position in the stream, so a resumed run draws the same augmentation. Default: `frame_arrays`.
+    to_sample: (frame, generator) -> a pytree of arrays whose shapes are the same for all samples. The generator depends
+    only on `seed` and the position in the stream, so a resumed run draws the same augmentation.
     num_epochs: None repeats for ever, and a batch may then span two epochs; otherwise a last partial batch is dropped.
     process_index, process_count: a batch of all processes together is cut into `process_count` equal parts, of
     `batch_size` samples each, and this process gets its part: the whole is the same however many share it.
@@ -95,11 +88,6 @@ def make_loader(
     The position (`EpisodeLoader.get_state`) is the same in every process, and good for another number of processes that
     share batches of the same size.
     """
-    if to_sample is None and len(set(reader.num_arms.values())) > 1:
-        raise ValueError(
-            f"make_loader: expected tasks with one number of arms, got {reader.num_arms}; arrays of 1 and 2 arms do not"
-            " batch: pass `to_sample` that turns poses into text of one length, or choose tasks of one kind"
-        )
     if num_epochs is not None and num_epochs * reader.num_frames < batch_size * process_count:
         raise ValueError(
             f"make_loader: expected at least {batch_size * process_count} frames for one batch, got"
@@ -109,7 +97,7 @@ def make_loader(
     if shuffle:
         dataset = dataset.shuffle()
     # The random map stands before the processes part, so that a sample is varied alike whoever reads it.
-    dataset = dataset.repeat(num_epochs).random_map(to_sample or frame_arrays)
+    dataset = dataset.repeat(num_epochs).random_map(to_sample)
     batches = dataset.batch(batch_size, drop_remainder=True)
     if process_count > 1:
         batches = batches[process_index : len(batches) // process_count * process_count : process_count]

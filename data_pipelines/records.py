@@ -10,15 +10,17 @@ Axes: F recorded frames of an episode, and A, H, W, K of ``dsvla_jax.types``. Wo
 import dataclasses
 import struct
 from collections.abc import Sequence
-from typing import Any, TypedDict, cast
+from typing import Any, cast
 
 import cv2
 import msgpack
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from dsvla_jax.errors import DataError
 from dsvla_jax.observation_checks import MAX_DEPTH
+from dsvla_jax.types import Action, Camera, Picture, RobotState
 
 RECORD_VERSION = 1
 DEPTH_UNIT = 1e-4
@@ -65,29 +67,24 @@ class Episode:
         return self.pose.shape[1]
 
 
-class Frame(TypedDict):
-    """One training sample before tokenisation: a frame of an episode with its pictures decoded.
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """One recorded moment of an episode, and the keyframe that follows."""
 
-    rgb: uint8 (H, W, 3). depth: float32 (H, W), metres, 0 where missing. intrinsics: float32 (3, 3).
-    world_from_camera: float32 (4, 4). pose: float32 (A, 7). gripper_open: float32 (A,). keypoint: float32 (A, 3), the
-    active one of each arm, or (0, 3) where none is known. target_pose: float32 (A, 7). target_gripper: float32 (A,).
-    task_index: into ``EpisodeReader.tasks``. episode: number in the reader. frame: number in the episode.
-    """
-
-    rgb: np.ndarray
-    depth: np.ndarray
-    intrinsics: np.ndarray
-    world_from_camera: np.ndarray
-    pose: np.ndarray
-    gripper_open: np.ndarray
-    keypoint: np.ndarray
-    target_pose: np.ndarray
-    target_gripper: np.ndarray
+    picture: Picture[np.ndarray]
+    robot: RobotState[np.ndarray]
+    keypoint: Float[np.ndarray, "k 3"]
+    """The active one of each arm, metres, world frame; none (K = 0) if none is known."""
+    target: Action[np.ndarray]
+    """The next keyframe."""
     instruction: str
     task: str
     task_index: int
+    """The task's place among those of the reader."""
     episode: int
+    """The episode's number in the reader's order."""
     frame: int
+    """The frame's number in its episode."""
 
 
 def encode_rgb(rgb: np.ndarray) -> bytes:
@@ -271,15 +268,14 @@ def _unpack_array(value: Any, where: object, field: str) -> np.ndarray:
 def decode_frame(episode: Episode, place: int, task_index: int = 0, episode_number: int = 0) -> Frame:
     """One frame of an episode as a sample, with writable arrays."""
     return Frame(
-        rgb=decode_rgb(episode.rgb_png[place]),
-        depth=decode_depth(episode.depth_png[place]),
-        intrinsics=episode.intrinsics[place].copy(),
-        world_from_camera=episode.world_from_camera[place].copy(),
-        pose=episode.pose[place].copy(),
-        gripper_open=episode.gripper_open[place].copy(),
+        picture=Picture(
+            decode_rgb(episode.rgb_png[place]),
+            decode_depth(episode.depth_png[place]),
+            Camera(episode.intrinsics[place].copy(), episode.world_from_camera[place].copy()),
+        ),
+        robot=RobotState(episode.pose[place].copy(), episode.gripper_open[place].copy()),
         keypoint=episode.active_keypoint[place].copy(),
-        target_pose=episode.target_pose[place].copy(),
-        target_gripper=episode.target_gripper[place].copy(),
+        target=Action(episode.target_pose[place].copy(), episode.target_gripper[place].copy()),
         instruction=episode.instruction,
         task=episode.task,
         task_index=task_index,

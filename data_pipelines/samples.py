@@ -1,12 +1,6 @@
-"""From a recorded frame to one training sample: augmentation, prompt and answer, tokens.
+"""From a recorded frame to one training example: augmentation, prompt and answer, tokens.
 
-The sample is a flat dict of arrays of fixed shape, in which one- and two-armed robots look alike:
-
-    rgb uint8 (H, W, 3), depth float32 (H, W), intrinsics float32 (3, 3), world_from_camera float32 (4, 4),
-    text_tokens int32 (T,), text_mask bool (T,), answer_mask bool (T,), number_rows int32 (T,).
-
-`answer_mask` is True on the tokens to learn; `number_rows` says of those of them that choose a bin of position or
-rotation which choice it is (`encoding.number_targets`), and is 0 elsewhere.
+Examples of one- and two-armed robots have the same shapes.
 """
 
 import dataclasses
@@ -21,13 +15,12 @@ from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.encoding.text import Tokenizer
-
-Sample = dict[str, np.ndarray]
+from dsvla_jax.types import Example, HeldOutExample, RobotState
 
 
 def make_sampler(
     data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer
-) -> Callable[[Frame, np.random.Generator], Sample]:
+) -> Callable[[Frame, np.random.Generator], Example[np.ndarray]]:
     """``sample(frame, rng)``: varies the frame as `data` says and writes its prompt and answer.
 
     Raises UserError where the tokenizer can not write answers number by number.
@@ -35,7 +28,7 @@ def make_sampler(
     numbers = number_rows(tokenizer, encoding.style)
     codec = encoding.codec
 
-    def sample(frame: Frame, rng: np.random.Generator) -> Sample:
+    def sample(frame: Frame, rng: np.random.Generator) -> Example[np.ndarray]:
         if data.shift_world > 0:
             # Horizontal only: the table, and with it the crop of the cloud, keeps its height.
             frame = shift_world(frame, random_offset(rng, (data.shift_world, data.shift_world, 0.0)))
@@ -49,26 +42,16 @@ def make_sampler(
             frame = perturb_keypoint(frame, rng, data.keypoint_noise, data.keypoint_noise_probability)
         prompt = build_prompt(
             encoding,
-            frame["instruction"],
-            frame["pose"],
-            frame["gripper_open"],
-            frame["keypoint"] if encoding.use_keypoints and len(frame["keypoint"]) else None,
+            frame.instruction,
+            frame.robot,
+            frame.keypoint if encoding.use_keypoints and len(frame.keypoint) else None,
         )
-        bins = np.asarray(codec.encode(frame["target_pose"], frame["target_gripper"]))
+        bins = np.asarray(codec.encode(frame.target.pose, frame.target.gripper_open))
         answer = format_answer(bins, encoding.style)
-        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
-        rows = np.zeros(len(tokens), np.int32)
+        text, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
+        rows = np.zeros(len(text.tokens), np.int32)
         rows[answer_mask] = numbers.rows(bins)
-        return {
-            "rgb": frame["rgb"],
-            "depth": frame["depth"],
-            "intrinsics": frame["intrinsics"],
-            "world_from_camera": frame["world_from_camera"],
-            "text_tokens": tokens,
-            "text_mask": mask,
-            "answer_mask": answer_mask,
-            "number_rows": rows,
-        }
+        return Example(frame.picture, text, answer_mask, rows)
 
     return sample
 
@@ -81,20 +64,16 @@ def require_texts_fit(encoding: EncodingConfig, tokenizer: Tokenizer, instructio
     """
     for text, arms in instructions:
         pose = np.tile(np.array([0.2, 0.1, 0.9, 0, 1, 0, 0], np.float32), (arms, 1))
-        gripper, keypoint = np.ones(arms, np.float32), np.zeros((arms, 3), np.float32)
-        prompt = build_prompt(encoding, text, pose, gripper, keypoint)
-        answer = format_answer(np.asarray(encoding.codec.encode(pose, gripper)), encoding.style)
+        robot = RobotState(pose, np.ones(arms, np.float32))
+        prompt = build_prompt(encoding, text, robot, np.zeros((arms, 3), np.float32))
+        answer = format_answer(np.asarray(encoding.codec.encode(pose, robot.gripper_open)), encoding.style)
         encode_text(tokenizer, prompt, answer, encoding.max_text_length)
 
 
 def make_validation_sampler(
     data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer
-) -> Callable[[Frame, np.random.Generator], Sample]:
-    """As `make_sampler`, of frames as they were recorded, with what the numbers of an answer are compared with:
-
-    integers int32 (2, 8), the answer's, zeros for a second arm that is not there; number_of int32 (T,), which of them,
-    counted from 1, each token belongs to, and 0 for tokens that belong to none.
-    """
+) -> Callable[[Frame, np.random.Generator], HeldOutExample[np.ndarray]]:
+    """Returns `sample(frame, rng)` for validation: as `make_sampler`, of frames as they were recorded."""
     plain = make_sampler(
         dataclasses.replace(data, shift_world=0, crop=1, colour_variation=0, state_jitter=0, keypoint_noise=0),
         encoding,
@@ -102,13 +81,13 @@ def make_validation_sampler(
     )
     numbers = number_rows(tokenizer, encoding.style)
 
-    def sample(frame: Frame, rng: np.random.Generator) -> Sample:
+    def sample(frame: Frame, rng: np.random.Generator) -> HeldOutExample[np.ndarray]:
         one = plain(frame, rng)
-        bins = np.asarray(encoding.codec.encode(frame["target_pose"], frame["target_gripper"]))
+        bins = np.asarray(encoding.codec.encode(frame.target.pose, frame.target.gripper_open))
         integers = np.zeros((2, bins.shape[1]), np.int32)
         integers[: len(bins)] = bins
-        number_of = np.zeros_like(one["number_rows"])
-        number_of[one["answer_mask"]] = numbers.numbers(bins)
-        return {**one, "integers": integers, "number_of": number_of}
+        number_of = np.zeros_like(one.number_rows)
+        number_of[one.answer_mask] = numbers.numbers(bins)
+        return HeldOutExample(one, integers, number_of)
 
     return sample

@@ -121,8 +121,9 @@ class DemonstrationWriter:
             raise DataError(where, "keyframes", f"ascending numbers from 1 to {count - 1}", str(numbers)[:80], fix)
         episode = make_demonstration(recording, sample_starts(numbers, self.every_n), number, where)
         self._check_box(episode, where)
-        first = decode_frame(episode, 0)
-        check_surface(first["depth"], first["intrinsics"], first["world_from_camera"], episode.keypoints, where)
+        first = decode_frame(episode, 0).picture
+        camera = first.camera
+        check_surface(first.depth, camera.intrinsics, camera.world_from_camera, episode.keypoints, where)
         self._check_size(episode, where)
         self._counts[recording.task] = number + 1
         self._waiting.setdefault(recording.task, []).append(episode)

@@ -12,13 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Float
 
 from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
 from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
-from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_observation, encode_text
+from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text, model_inputs
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer, save_tokenizer, vocabulary_digest
 from dsvla_jax.encoding.prompts import format_answer
@@ -31,7 +32,7 @@ from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.types import Action, Array, ModelInputs, Observation
+from dsvla_jax.types import Action, Array, Observation, RobotState, Text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,14 +84,12 @@ def _decode(
     tokenizer: Tokenizer,
     decoding: Decoding,
     variables: Variables,
-    observation: Observation,
-    text_tokens: Array,
-    text_mask: Array,
+    observation: Observation[Array],
+    text: Text[Array],
     key: Array | None,
 ) -> Decoded:
-    picture = encode_observation(observation, config.encoding)
-    inputs = ModelInputs(**picture, text_tokens=text_tokens, text_mask=text_mask)
-    grammar = build_answer_grammar(tokenizer, observation.pose.shape[1], config.encoding.style)
+    inputs = model_inputs(observation.picture, text, config.encoding)
+    grammar = build_answer_grammar(tokenizer, observation.robot.pose.shape[1], config.encoding.style)
     return decode_actions(VLA(config.model), variables, inputs, grammar, decoding, key)
 
 
@@ -110,11 +109,11 @@ class Policy:
         return self.config.encoding.codec
 
     def encode_prompt(
-        self, instruction: str, pose: np.ndarray, gripper_open: np.ndarray, keypoints: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The question of one robot as tokens int32 (T,) and their mask bool (T,), see `encode_text`.
+        self, instruction: str, robot: RobotState[np.ndarray], keypoints: Float[np.ndarray, "a 3"] | None
+    ) -> Text[np.ndarray]:
+        """Encodes the question of one robot; see `encode_text`.
 
-        pose: (A, 7). gripper_open: (A,). keypoints: (A, 3), the active ones, or None.
+        keypoints: the active one of each arm, metres, world frame, or None.
         Raises UserError if the instruction has a word or number that no token stands for, ValueError if it is too long.
         """
         if unknown := unknown_words([instruction], self.tokenizer):
@@ -123,8 +122,8 @@ class Policy:
                 "was trained with"
             )
         encoding = self.config.encoding
-        prompt = build_prompt(encoding, instruction, pose, gripper_open, keypoints)
-        return encode_text(self.tokenizer, prompt, None, encoding.max_text_length)[:2]
+        prompt = build_prompt(encoding, instruction, robot, keypoints)
+        return encode_text(self.tokenizer, prompt, None, encoding.max_text_length)[0]
 
     def act(
         self, observation: Observation, instructions: Sequence[str], keypoints: np.ndarray | None
@@ -143,30 +142,33 @@ class Policy:
     ) -> Decision:
         """The next key pose of every robot of a batch. It is well-formed whatever the weights are.
 
-        observation: with a leading axis B of any size; pose (B, A, 7). keypoints: float32 (B, A, 3), the active one of
+        observation: with a leading axis B of any size. keypoints: float32 (B, A, 3), the active one of
         each arm, in metres and the world frame, or None. key: for ``decoding`` that samples. prompt_tokens: the length
         to pad prompts to, which none may exceed; if not given, the next multiple of `PROMPT_TOKENS`.
         """
-        size, poses, grippers = len(instructions), np.asarray(observation.pose), np.asarray(observation.gripper_open)
+        size, robots = len(instructions), jax.tree.map(np.asarray, observation.robot)
         encoded = [
-            self.encode_prompt(text, poses[i], grippers[i], None if keypoints is None else keypoints[i])
+            self.encode_prompt(
+                text, jax.tree.map(lambda x, i=i: x[i], robots), None if keypoints is None else keypoints[i]
+            )
             for i, text in enumerate(instructions)
         ]
-        tokens, masks = (np.stack(column) for column in zip(*encoded, strict=True))
-        longest = prompt_tokens or -(-int(masks.sum(axis=1).max()) // PROMPT_TOKENS) * PROMPT_TOKENS
-        tokens, masks = tokens[:, :longest], masks[:, :longest]
+        text = jax.tree.map(lambda *rows: np.stack(rows), *encoded)
+        longest = prompt_tokens or -(-int(text.mask.sum(axis=1).max()) // PROMPT_TOKENS) * PROMPT_TOKENS
+        text = jax.tree.map(lambda x: x[:, :longest], text)
         if full_size(size) > size:
             # Others of the batch have no influence, so any will do to fill it up.
             rows = np.arange(full_size(size)) % size
-            observation, tokens, masks = jax.tree.map(lambda x: x[rows], (observation, tokens, masks))
-        decoded = _decode(self.config, self.tokenizer, self.decoding, self.variables, observation, tokens, masks, key)
+            observation, text = jax.tree.map(lambda x: x[rows], (observation, text))
+        decoded = _decode(self.config, self.tokenizer, self.decoding, self.variables, observation, text, key)
         bins, log_probs, entropies = (
             np.asarray(x)[:size] for x in (decoded.integers, decoded.log_probs, decoded.entropies)
         )
         texts = [format_answer(row, self.config.encoding.style) for row in bins]
         action = jax.vmap(self.codec.decode)(jnp.asarray(bins))
         if (scale := self.config.displacement) is not None:
-            action = action.replace(pose=jnp.asarray(displace(poses, scale.from_pose(action.pose, self.codec))))
+            reached = displace(robots.pose, scale.from_pose(action.pose, self.codec))
+            action = dataclasses.replace(action, pose=jnp.asarray(reached))
         return Decision(action, texts, log_probs, entropies)
 
 

@@ -1,78 +1,161 @@
-"""The words every room of the project speaks.
+"""Core data types, and the conventions for array dimensions used throughout.
 
-Array dimensions are named by one letter everywhere, in this order of appearance:
+An array dimension has one letter everywhere:
 
-    B  batch of examples or of parallel episodes      T  text tokens
-    A  arms (1 or 2; the left arm first)              V  vocabulary
-    H, W  image height and width, in pixels           D  feature channels
-    P  points of a cloud                              G  3D tokens (groups); also FPS centres
-    N  2D image patches                               K  neighbours, or keypoints where no cloud is near
-    L  answer tokens
+    b  batch of examples or of parallel episodes      t  text tokens
+    a  arms (1 or 2; the left arm first)              v  vocabulary
+    h, w  image height and width, pixels              d  feature channels
+    p  points of a cloud                              g  3D tokens (groups); also FPS centres
+    n  2D image patches                               k  neighbours, or keypoints where no cloud is near
+    l  answer tokens                                  s  side of the square image the network sees, pixels
+
+Docstrings write them in capitals. A struct holds one item or a batch: `*b` stands for any number of leading axes, the
+same for all its fields. The structs are generic in the array type: `Example[np.ndarray]` on the host,
+`Example[jax.Array]` in a traced function, `Example[jax.ShapeDtypeStruct]` for shapes alone.
 
 Lengths are metres, angles radians, images row-major. The world frame has z up and the table top at z = 0.752, as in
 RLBench. A pose is [x, y, z, qx, qy, qz, qw] of the end-effector (the tool centre point between the finger tips) in
-the world frame. Quaternions are xyzw, unit length, canonical (qw >= 0). ``gripper_open`` is 1 for open, 0 for closed.
+the world frame. Quaternions are xyzw, unit length, canonical (qw >= 0). `gripper_open` is 1 for open, 0 for closed.
 """
 
+import dataclasses
+from typing import Generic, TypeVar, dataclass_transform
+
 import jax
-from flax import struct
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
 
 Array = jax.Array
 
+ArrayT = TypeVar("ArrayT", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
+"""The type of a struct's arrays."""
+
 TABLE_HEIGHT = 0.752
 
+T = TypeVar("T")
 
-@struct.dataclass
-class Camera:
-    """A pinhole camera in the RLBench/PyRep convention.
 
-    intrinsics: float32 (3, 3). The focal lengths are negative for RLBench's cameras, and are never made positive:
-        u = fx X / Z + cx, v = fy Y / Z + cy for a point (X, Y, Z) in the camera frame, Z > 0 in front.
-    world_from_camera: float32 (4, 4), camera-to-world.
+@dataclass_transform(frozen_default=True)
+def pytree(cls: type[T]) -> type[T]:
+    """Makes a class a frozen dataclass that is a pytree of its fields.
+
+    JAX rebuilds pytrees of placeholders, which are no arrays: the rebuilt object skips `__init__`, and with it the
+    shape checks that the tests switch on (JAX documentation, "Custom pytrees and initialization").
     """
+    made = dataclasses.dataclass(frozen=True)(cls)
+    names = tuple(field.name for field in dataclasses.fields(made))  # pyright: ignore[reportArgumentType]
 
-    intrinsics: Array
-    world_from_camera: Array
+    def flatten(value: T) -> tuple[tuple[object, ...], None]:
+        return tuple(getattr(value, name) for name in names), None
 
+    def flatten_with_keys(value: T) -> tuple[tuple[tuple[jax.tree_util.GetAttrKey, object], ...], None]:
+        return tuple((jax.tree_util.GetAttrKey(name), getattr(value, name)) for name in names), None
 
-@struct.dataclass
-class Observation:
-    """What a policy may look at: one RGB-D picture, the robot's own state and the active keypoint of each arm.
+    def unflatten(_: None, children: tuple[object, ...]) -> T:
+        value = object.__new__(made)
+        for name, child in zip(names, children, strict=True):
+            object.__setattr__(value, name, child)
+        return value
 
-    rgb: uint8 (H, W, 3).
-    depth: float32 (H, W), planar Z in metres; 0 or a non-finite value marks a missing reading.
-    camera: the camera of both.
-    pose: float32 (A, 7). gripper_open: float32 (A,).
-    """
-
-    rgb: Array
-    depth: Array
-    camera: Camera
-    pose: Array
-    gripper_open: Array
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    return made
 
 
-@struct.dataclass
-class Action:
-    """The next key pose. pose: float32 (A, 7). gripper_open: float32 (A,), 0 or 1, applied once the pose is reached."""
-
-    pose: Array
-    gripper_open: Array
+def named_arrays(tree: object) -> dict[str, Array | np.ndarray]:
+    """Returns the arrays of a struct by their paths, such as `picture.camera.intrinsics`."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-@struct.dataclass
-class ModelInputs:
-    """What the network eats; made from an Observation and text by ``dsvla_jax.encoding`` and nowhere else.
+@pytree
+class Camera(Generic[ArrayT]):
+    """A pinhole camera in the RLBench/PyRep convention."""
 
-    image: float32 (S, S, 3), normalised as CLIP's.
-    point_tokens: float32 (G, D3), from the 3D tokenizer; G = 0 for a policy without 3D input.
-    point_patches: int32 (G,), the image patch (row-major) whose positional embedding each 3D token carries.
-    text_tokens: int32 (T,), beginning-of-sequence, prompt [and answer], padded at the end.
-    text_mask: bool (T,), False on padding.
-    """
+    intrinsics: Float[ArrayT, "*b 3 3"]
+    """float32. The focal lengths are negative for RLBench's cameras, and are never made positive:
+    u = fx X / Z + cx, v = fy Y / Z + cy for a point (X, Y, Z) in the camera frame, Z > 0 in front."""
+    world_from_camera: Float[ArrayT, "*b 4 4"]
+    """float32, camera-to-world."""
 
-    image: Array
-    point_tokens: Array
-    point_patches: Array
-    text_tokens: Array
-    text_mask: Array
+
+@pytree
+class Picture(Generic[ArrayT]):
+    """One RGB-D picture and the camera that took it."""
+
+    rgb: UInt8[ArrayT, "*b h w 3"]
+    depth: Float[ArrayT, "*b dh dw"]
+    """float32, planar Z in metres; 0 or a non-finite value marks a missing reading. As large as `rgb`, or one missing
+    pixel (1, 1) for data without depth."""
+    camera: Camera[ArrayT]
+
+
+@pytree
+class RobotState(Generic[ArrayT]):
+    """The robot's own reading of its arms."""
+
+    pose: Float[ArrayT, "*b a 7"]
+    gripper_open: Float[ArrayT, "*b a"]
+
+
+@pytree
+class Observation(Generic[ArrayT]):
+    """What a policy may look at: a picture and the robot's state."""
+
+    picture: Picture[ArrayT]
+    robot: RobotState[ArrayT]
+
+
+@pytree
+class Action(Generic[ArrayT]):
+    """The next keyframe. The gripper moves once the pose is reached."""
+
+    pose: Float[ArrayT, "*b a 7"]
+    gripper_open: Float[ArrayT, "*b a"]
+    """0 or 1."""
+
+
+@pytree
+class Text(Generic[ArrayT]):
+    """Token sequences, padded at the end."""
+
+    tokens: Int[ArrayT, "*b t"]
+    """int32: beginning-of-sequence, prompt [, answer, end-of-sequence], padding."""
+    mask: Bool[ArrayT, "*b t"]
+    """False on padding."""
+
+
+@pytree
+class Example(Generic[ArrayT]):
+    """What a policy learns from: a picture, and prompt and answer as text."""
+
+    picture: Picture[ArrayT]
+    text: Text[ArrayT]
+    answer_mask: Bool[ArrayT, "*b t"]
+    """True on the tokens to learn: the answer's, and its end."""
+    number_rows: Int[ArrayT, "*b t"]
+    """int32: on tokens that choose a bin of position or rotation, which choice it is (`encoding.number_targets`);
+    0 elsewhere."""
+
+
+@pytree
+class HeldOutExample(Generic[ArrayT]):
+    """An example with the integers of its answer, for comparison with a policy's."""
+
+    example: Example[ArrayT]
+    integers: Int[ArrayT, "*b 2 8"]
+    """int32: the answer's; zeros for a second arm that is not there."""
+    number_of: Int[ArrayT, "*b t"]
+    """int32: which of the integers, counted from 1, a token belongs to; 0 for none."""
+
+
+@pytree
+class ModelInputs(Generic[ArrayT]):
+    """What the network reads. `encoding.encode.model_inputs` makes it."""
+
+    image: Float[ArrayT, "*b s s 3"]
+    """float32, normalised as CLIP's."""
+    point_tokens: Float[ArrayT, "*b g d"]
+    """float32, from the 3D tokenizer; G = 0 for a policy without 3D input."""
+    point_patches: Int[ArrayT, "*b g"]
+    """int32: the image patch (row-major) whose positional embedding a 3D token carries."""
+    text: Text[ArrayT]

@@ -12,8 +12,8 @@ from tests.test_data import random_episode
 
 def project(points, frame):
     """Pixels of world points, written out with homogeneous matrices."""
-    camera = np.linalg.inv(frame["world_from_camera"].astype(np.float64)) @ np.append(points, 1.0)
-    pixel = frame["intrinsics"].astype(np.float64) @ camera[:3]
+    camera = np.linalg.inv(frame.picture.camera.world_from_camera.astype(np.float64)) @ np.append(points, 1.0)
+    pixel = frame.picture.camera.intrinsics.astype(np.float64) @ camera[:3]
     return pixel[:2] / pixel[2]
 
 
@@ -27,8 +27,8 @@ def test_shift_world_keeps_every_pixel():
             project(shifted[field][0, :3], shifted), project(frame[field][0, :3], frame), atol=1e-3
         )
         np.testing.assert_allclose(shifted[field][0, :3] - frame[field][0, :3], offset, atol=1e-6)
-    np.testing.assert_array_equal(shifted["pose"][:, 3:], frame["pose"][:, 3:])
-    assert shifted["rgb"] is frame["rgb"]
+    np.testing.assert_array_equal(shifted.robot.pose[:, 3:], frame.robot.pose[:, 3:])
+    assert shifted.picture.rgb is frame.picture.rgb
 
 
 def smooth_frame(size=64):
@@ -41,34 +41,35 @@ def smooth_frame(size=64):
 
 
 def world_points(frame):
-    v, u = np.mgrid[: frame["depth"].shape[0], : frame["depth"].shape[1]]
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame["intrinsics"].astype(np.float64)).T
-    points = rays * frame["depth"][..., None]
-    return points @ frame["world_from_camera"][:3, :3].T + frame["world_from_camera"][:3, 3]
+    v, u = np.mgrid[: frame.picture.depth.shape[0], : frame.picture.depth.shape[1]]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.picture.camera.intrinsics.astype(np.float64)).T
+    points = rays * frame.picture.depth[..., None]
+    return points @ frame.picture.camera.world_from_camera[:3, :3].T + frame.picture.camera.world_from_camera[:3, 3]
 
 
 def test_a_crop_keeps_every_point_at_its_place():
     frame = smooth_frame()
     for seed in range(20):
         cropped = augment.random_crop(frame, np.random.default_rng(seed), 0.4)
-        assert cropped["depth"].shape == (64, 64)
+        assert cropped.picture.depth.shape == (64, 64)
         for name in ("world_from_camera", "pose", "target_pose", "keypoint"):
             np.testing.assert_array_equal(cropped[name], frame[name])
         # Where the original camera sees each point of the cropped cloud, its picture has the same colour and depth.
         for v in range(0, 64, 7):
             for u in range(0, 64, 7):
                 x, y = project(world_points(cropped)[v, u], frame)
-                np.testing.assert_allclose(cropped["rgb"][v, u, :2], [3 * x, 3 * y], atol=1.1)
-                assert abs(cropped["depth"][v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
+                np.testing.assert_allclose(cropped.picture.rgb[v, u, :2], [3 * x, 3 * y], atol=1.1)
+                assert abs(cropped.picture.depth[v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
     assert (
-        augment.random_crop(frame, np.random.default_rng(0), 1.0)["intrinsics"].tolist() == frame["intrinsics"].tolist()
+        augment.random_crop(frame, np.random.default_rng(0), 1.0)["intrinsics"].tolist()
+        == frame.picture.camera.intrinsics.tolist()
     )
 
 
 def test_a_window_of_the_picture_is_that_window():
     frame = smooth_frame(65)
     cropped = augment.crop(frame, 10, 20, 33, 33)
-    np.testing.assert_array_equal(cropped["rgb"][::2, ::2], frame["rgb"][10:43, 20:53])
+    np.testing.assert_array_equal(cropped.picture.rgb[::2, ::2], frame.picture.rgb[10:43, 20:53])
     np.testing.assert_allclose(world_points(cropped)[::2, ::2], world_points(frame)[10:43, 20:53], atol=1e-5)
     with pytest.raises(ValueError, match="crop: expected a window within 65 x 65"):
         augment.crop(frame, 40, 0, 32, 32)
@@ -98,7 +99,7 @@ def test_noise_changes_what_it_says_and_nothing_else():
             np.testing.assert_array_equal(frame[name], before[name])
             np.testing.assert_array_equal(result[name], again[name])
             assert np.array_equal(result[name], frame[name]) == (name != changed)
-    moved = variations["keypoint"](np.random.default_rng(2))["keypoint"] - frame["keypoint"]
+    moved = variations["keypoint"](np.random.default_rng(2))["keypoint"] - frame.keypoint
     assert 0 < np.abs(moved).max() <= 0.03 + 1e-6
     assert augment.perturb_keypoint(frame, np.random.default_rng(0), 0.03, 0.0) is frame
-    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0)["rgb"], frame["rgb"])
+    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0)["rgb"], frame.picture.rgb)

@@ -111,8 +111,8 @@ def test_reader_numbers_all_episodes_and_frames(folder):
     seen = [reader.locate(number) for number in range(reader.num_frames)]
     assert seen == [(seed, place) for seed in range(7) for place in range(1 + seed % 4)]
     frame = reader.frame(seen.index((5, 1)))
-    assert frame["instruction"] == "do lamp_on number 5"
-    np.testing.assert_array_equal(frame["pose"], random_episode(5, frames=2).pose[1])
+    assert frame.instruction == "do lamp_on number 5"
+    np.testing.assert_array_equal(frame.robot.pose, random_episode(5, frames=2).pose[1])
     assert len(EpisodeReader(folder, episodes=4)) == 4
     with pytest.raises(DataError, match="episodes of lamp_on: expected at least 8, got 7; run"):
         EpisodeReader(folder, episodes=8)
@@ -271,7 +271,7 @@ def test_processes_cut_the_same_batches_and_take_over_from_each_other(folder):
     """A batch of 4 is the same one whether 1, 2 or 4 processes share it, and a position is good for any of them."""
 
     def sample(frame, rng):
-        return {"keypoint": augment.perturb_keypoint(frame, rng, 0.03, 0.5)["keypoint"], "frame": frame["frame"]}
+        return {"keypoint": augment.perturb_keypoint(frame, rng, 0.03, 0.5)["keypoint"], "frame": frame.frame}
 
     def loaders(count):
         split = [{"process_index": i, "process_count": count} for i in range(count)]
@@ -302,7 +302,7 @@ def test_mixed_arms_need_a_text_sample(tmp_path):
         make_loader(reader, batch_size=2, seed=0)
 
     def sample(frame, rng):
-        return {"rgb": frame["rgb"], "task": frame["task_index"]}
+        return {"rgb": frame.picture.rgb, "task": frame.task_index}
 
     batch = next(make_loader(reader, sample, batch_size=6, seed=0))
     assert sorted(batch["task"]) == [0, 0, 0, 1, 1, 1]
@@ -439,9 +439,9 @@ def test_recorded_expert_succeeds_again_from_its_seed(tmp_path):
     first = environment.observe(state)
     for i in range(2):
         frame = decode_frame(reader.episode(i), 0)
-        np.testing.assert_array_equal(frame["rgb"], first.rgb[i])
+        np.testing.assert_array_equal(frame.picture.rgb, first.rgb[i])
         # The format keeps tenths of a millimetre.
-        np.testing.assert_allclose(frame["depth"], mark_missing(np.asarray(first.depth[i])), atol=1e-4)
+        np.testing.assert_allclose(frame.picture.depth, mark_missing(np.asarray(first.depth[i])), atol=1e-4)
     for m in range(episode.num_frames):
         both = [reader.episode(i) for i in range(2)]
         pose = jnp.stack([x.target_pose[m] for x in both])
@@ -462,9 +462,11 @@ def test_keypoints_of_demonstrations_may_be_those_found_in_the_first_picture():
     for episode in episodes:
         start = expert.environment.reset(episode_keys(0, "train", "lamp_on", episode.seed, 1))
         frame, point = decode_frame(episode, 0), episode.keypoints[0, 0]
-        camera = Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
+        camera = Camera(
+            jnp.asarray(frame.picture.camera.intrinsics), jnp.asarray(frame.picture.camera.world_from_camera)
+        )
         (u, v), depth = project(jnp.asarray(point), camera)
-        assert abs(frame["depth"][round(float(v)), round(float(u))] - depth) < 0.01
+        assert abs(frame.picture.depth[round(float(v)), round(float(u))] - depth) < 0.01
         away = np.linalg.norm(point - np.asarray(expert.environment.keypoints(start))[0, 0, 0])
         assert 1e-4 < away < 0.03
 

@@ -54,11 +54,11 @@ def test_the_example_of_own_demonstrations_works(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines() == ["6 samples: pick up the block"] * 3
     frame = EpisodeReader("data/mine").frame(0)
     # The keypoint is in the block: what is seen where it projects to is red and nearer than the table.
-    camera = Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
-    pixel, depth = project(frame["keypoint"][0], camera)
+    camera = Camera(jnp.asarray(frame.picture.camera.intrinsics), jnp.asarray(frame.picture.camera.world_from_camera))
+    pixel, depth = project(frame.keypoint[0], camera)
     u, v = np.rint(np.asarray(pixel)).astype(int)
-    np.testing.assert_array_equal(frame["rgb"][v, u], [200, 40, 40])
-    np.testing.assert_allclose(np.array([frame["depth"][v, u], float(depth)]), 0.95, atol=1e-4)
+    np.testing.assert_array_equal(frame.picture.rgb[v, u], [200, 40, 40])
+    np.testing.assert_allclose(np.array([frame.picture.depth[v, u], float(depth)]), 0.95, atol=1e-4)
 
 
 @pytest.mark.parametrize("page", [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"], ids=lambda page: page.name)

@@ -171,9 +171,9 @@ def test_a_recording_becomes_an_episode(tmp_path):
     np.testing.assert_allclose(episode.world_from_camera, np.broadcast_to(CAMERA, (4, 4, 4)), atol=1e-6)
     for place, start in enumerate(starts):
         frame = decode_frame(episode, place)
-        np.testing.assert_array_equal(frame["rgb"], GOOD.rgb[start])
-        np.testing.assert_allclose(frame["depth"], GOOD.depth[start], atol=1e-4)
-        np.testing.assert_allclose(frame["keypoint"], [[0.2, 0, 0.8]], atol=1e-6)
+        np.testing.assert_array_equal(frame.picture.rgb, GOOD.rgb[start])
+        np.testing.assert_allclose(frame.picture.depth, GOOD.depth[start], atol=1e-4)
+        np.testing.assert_allclose(frame.keypoint, [[0.2, 0, 0.8]], atol=1e-6)
 
 
 def test_channels_and_quaternions_are_put_right(tmp_path):
@@ -181,8 +181,8 @@ def test_channels_and_quaternions_are_put_right(tmp_path):
     with DemonstrationWriter(tmp_path) as writer:
         writer.add(make_recording(rgb=np.asarray(GOOD.rgb)[..., ::-1], channels="bgr", pose=pose), keyframes=[5, 11])
     frame = EpisodeReader(tmp_path).frame(0)
-    np.testing.assert_array_equal(frame["rgb"], GOOD.rgb[0])
-    np.testing.assert_allclose(frame["pose"][:, 3:], [[0, 1, 0, 0]], atol=1e-6)
+    np.testing.assert_array_equal(frame.picture.rgb, GOOD.rgb[0])
+    np.testing.assert_allclose(frame.robot.pose[:, 3:], [[0, 1, 0, 0]], atol=1e-6)
 
 
 def test_key_poses_are_found_or_named(tmp_path):

@@ -1,6 +1,7 @@
 """Pictures of one recorded frame: marks on the image, and its cloud seen from above and from the side."""
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,16 +20,16 @@ _MARGIN = 0.4
 
 def camera_of(frame: Frame) -> Camera:
     """The camera of a frame."""
-    return Camera(jnp.asarray(frame["intrinsics"]), jnp.asarray(frame["world_from_camera"]))
+    return jax.tree.map(jnp.asarray, frame.picture.camera)
 
 
 def draw_frame(frame: Frame) -> np.ndarray:
     """uint8 (H, W, 3): the picture with a ring at each arm's target and a yellow cross at each active keypoint."""
-    picture = mark_targets(frame["rgb"], frame["target_pose"][:, :3], camera_of(frame))
+    picture = mark_targets(frame.picture.rgb, frame.target.pose[:, :3], camera_of(frame))
     height, width = picture.shape[:2]
-    if not len(frame["keypoint"]):
+    if not len(frame.keypoint):
         return picture
-    pixels, depth = map(np.asarray, project(frame["keypoint"], camera_of(frame)))
+    pixels, depth = map(np.asarray, project(frame.keypoint, camera_of(frame)))
     for (u, v), z in zip(pixels, depth, strict=True):
         if z > 0 and 0 <= u < width and 0 <= v < height:
             place = (round(float(u)), round(float(v)))
@@ -39,15 +40,15 @@ def draw_frame(frame: Frame) -> np.ndarray:
 
 def frame_cloud(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Every reading as a world point float32 (P, 3), and its colour uint8 (P, 3)."""
-    measured = frame["depth"] > 0
-    points = np.asarray(unproject(frame["depth"], camera_of(frame)))
-    return points[measured], frame["rgb"][measured]
+    measured = frame.picture.depth > 0
+    points = np.asarray(unproject(frame.picture.depth, camera_of(frame)))
+    return points[measured], frame.picture.rgb[measured]
 
 
 def draw_clouds(frame: Frame) -> list[tuple[str, np.ndarray]]:
     """(caption, picture) of the cloud from above and from the side, with pose, target and keypoint."""
     points, colours = frame_cloud(frame)
-    marks = [(frame["pose"][:, :3], _POSE), (frame["target_pose"][:, :3], _TARGET), (frame["keypoint"], _KEYPOINT)]
+    marks = [(frame.robot.pose[:, :3], _POSE), (frame.target.pose[:, :3], _TARGET), (frame.keypoint, _KEYPOINT)]
     views = {
         "cloud from above: y to the right, x down": (1, 0, 2, (1, 1)),
         "cloud from the side: x to the right, z up": (0, 2, 1, (1, -1)),

@@ -66,13 +66,13 @@ class _Look:
 
 
 def _look(frame: Frame, encoding: EncodingConfig) -> _Look:
-    depth = frame["depth"]
+    depth = frame.picture.depth
     readings = depth[depth > 0]
     _, valid = cloud_from_depth(
         depth, camera_of(frame), encoding.workspace_low, encoding.workspace_high, encoding.stride
     )
     points, _ = frame_cloud(frame)
-    distances = [np.linalg.norm(points - point, axis=1).min() for point in frame["keypoint"]] if len(points) else []
+    distances = [np.linalg.norm(points - point, axis=1).min() for point in frame.keypoint] if len(points) else []
     return _Look(
         missing=1 - len(readings) / depth.size,
         nearest=float(readings.min()) if len(readings) else float("nan"),
@@ -83,12 +83,19 @@ def _look(frame: Frame, encoding: EncodingConfig) -> _Look:
 
 
 def _features(frame: Frame) -> Table:
-    rows = [
-        (name, str(value.dtype), " x ".join(map(str, value.shape)), UNITS[name])
-        for name, value in frame.items()
-        if isinstance(value, np.ndarray)
-    ]
-    rows += [(name, "text", "", repr(frame[name])) for name in ("instruction", "task")]
+    arrays = {
+        "rgb": frame.picture.rgb,
+        "depth": frame.picture.depth,
+        "intrinsics": frame.picture.camera.intrinsics,
+        "world_from_camera": frame.picture.camera.world_from_camera,
+        "pose": frame.robot.pose,
+        "gripper_open": frame.robot.gripper_open,
+        "keypoint": frame.keypoint,
+        "target_pose": frame.target.pose,
+        "target_gripper": frame.target.gripper_open,
+    }
+    rows = [(name, str(value.dtype), " x ".join(map(str, value.shape)), UNITS[name]) for name, value in arrays.items()]
+    rows += [("instruction", "text", "", repr(frame.instruction)), ("task", "text", "", repr(frame.task))]
     return Table("features of a sample", ("feature", "type", "shape", "unit"), rows, numbers=False)
 
 
@@ -199,10 +206,10 @@ def _section(episode: Episode, number: int, encoding: EncodingConfig) -> Section
     caption = "what is seen; rings: where to go next (magenta the left or only arm, cyan the right); crosses: keypoints"
     lines = []
     for frame in frames:
-        keypoints = frame["keypoint"] if len(frame["keypoint"]) else None
-        bins = np.asarray(encoding.codec.encode(frame["target_pose"], frame["target_gripper"]))
+        keypoints = frame.keypoint if len(frame.keypoint) else None
+        bins = np.asarray(encoding.codec.encode(frame.target.pose, frame.target.gripper_open))
         lines += [
-            build_prompt(encoding, frame["instruction"], frame["pose"], frame["gripper_open"], keypoints),
+            build_prompt(encoding, frame.instruction, frame.robot, keypoints),
             f"    {format_answer(bins, encoding.style)}",
         ]
     heading = f"{episode.task}, episode {number}: “{episode.instruction}”"

@@ -31,6 +31,7 @@ from dsvla_jax.encoding.displacement import displace
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.evaluation.report import MAX_STRIP_FRAMES, film_strip
+from dsvla_jax.types import Action, Picture, RobotState
 
 _VERSION = re.compile(r"\d+\.\d+\.\d+")
 LOOKED_AT = 200
@@ -156,7 +157,7 @@ def _section(opened: OpenDataset, number: int, encoding: EncodingConfig, scale: 
     samples = opened.read(number)
     chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_STRIP_FRAMES).round().astype(int))
     frames = [_frame(samples[i], i, opened.config) for i in chosen]
-    pictures = [frame["rgb"] if samples[0].camera is None else draw_frame(frame) for frame in frames]
+    pictures = [frame.picture.rgb if samples[0].camera is None else draw_frame(frame) for frame in frames]
     caption = f"{len(chosen)} of {len(samples)} samples, cut and coloured as training may see them"
     if samples[0].camera is not None:
         caption += "; rings: where to go next"
@@ -173,21 +174,16 @@ def _section(opened: OpenDataset, number: int, encoding: EncodingConfig, scale: 
 def _frame(sample: EncodedSample, number: int, config: OxeConfig) -> Frame:
     """A sample with its picture decoded and varied, in the shape that demonstrations have."""
     rgb = np.empty((config.image_size, config.image_size, 3), np.uint8)
-    camera = write_picture(sample, np.random.default_rng(number), config, sample.camera is not None, rgb)
+    depth, camera = write_picture(sample, np.random.default_rng(number), config, sample.camera is not None, rgb)
     target = sample.target_pose
     if target is None:
         assert sample.displacement is not None
         target = displace(sample.pose, sample.displacement)
     return Frame(
-        rgb=rgb,
-        depth=camera["depth"],
-        intrinsics=camera["intrinsics"],
-        world_from_camera=camera["world_from_camera"],
-        pose=sample.pose,
-        gripper_open=sample.gripper_open,
+        picture=Picture(rgb, depth, camera),
+        robot=RobotState(sample.pose, sample.gripper_open),
         keypoint=np.zeros((0, 3), np.float32),
-        target_pose=target,
-        target_gripper=sample.target_gripper,
+        target=Action(target, sample.target_gripper),
         instruction=sample.instruction,
         task=sample.dataset,
         task_index=0,

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from typing import Any, SupportsIndex
 
 import grain
+import numpy as np
 
-from data_pipelines.loader import Sample
 from data_pipelines.oxe.mixture import ENDLESS, EncodedSample, MixtureSource
 from data_pipelines.oxe.samples import make_batcher
 from data_pipelines.oxe.scale import MixtureScale
@@ -19,9 +19,10 @@ from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.text import Tokenizer, check_words
 from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.types import Example
 
 
-class OxeLoader(Iterator[Sample]):
+class OxeLoader(Iterator[Example[np.ndarray]]):
     """Endless batches. `scale`: what displacements are binned over, None for absolute targets.
 
     left_out: records and frames that were skipped so far, and why.
@@ -65,14 +66,14 @@ class OxeLoader(Iterator[Sample]):
         batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
         options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=ahead)
         dataset = batches.map(to_batch).to_iter_dataset(options)
-        self._batches: grain.DatasetIterator[Sample] = iter(dataset)
+        self._batches: grain.DatasetIterator[Example[np.ndarray]] = iter(dataset)
 
     @property
     def num_samples(self) -> int:
         """Of all datasets, each once."""
         return self.source.num_samples
 
-    def __next__(self) -> Sample:
+    def __next__(self) -> Example[np.ndarray]:
         return next(self._batches)
 
     def get_state(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""From encoded frames to the batch that training takes: the same keys as ``data_pipelines.samples``.
+"""From encoded frames to a batch of examples.
 
 The prompt is the one of simulated demonstrations without the keypoint sentence. Where there is no calibrated depth,
 `depth` is one missing pixel and the camera zeros: a policy without 3D tokens reads neither.
@@ -6,13 +6,14 @@ The prompt is the one of simulated demonstrations without the keypoint sentence.
 
 from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
+from jaxtyping import Float
 
 from data_pipelines.oxe.mixture import EncodedSample
 from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
 from data_pipelines.rlds.features import decode_image
-from data_pipelines.samples import Sample
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig, encode_text
 from dsvla_jax.encoding.number_targets import number_rows
@@ -20,6 +21,7 @@ from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import DataError
 from dsvla_jax.observation_checks import check_depth
+from dsvla_jax.types import Camera, Example, Picture, Text
 
 
 def make_batcher(
@@ -29,7 +31,7 @@ def make_batcher(
     scale: MixtureScale | None,
     seed: int,
     leave_out: Callable[[tuple[str, str]], None],
-) -> Callable[[Sequence[tuple[int, EncodedSample]]], Sample | None]:
+) -> Callable[[Sequence[tuple[int, EncodedSample]]], Example[np.ndarray] | None]:
     """``batch(numbered frames)``. scale: for relative targets. A frame's variation depends on `seed` and its number.
 
     leave_out: is told of frames whose picture cannot be decoded where `config.skip_bad`. Such a frame gives its place
@@ -37,33 +39,34 @@ def make_batcher(
     """
     numbers = number_rows(tokenizer, encoding.style)
 
-    def text(prompt: str, answer: str, bins: np.ndarray) -> Sample:
-        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
-        rows = np.zeros(len(tokens), np.int32)
+    def words(prompt: str, answer: str, bins: np.ndarray) -> tuple[Text[np.ndarray], np.ndarray, np.ndarray]:
+        text, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
+        rows = np.zeros(len(text.tokens), np.int32)
         rows[answer_mask] = numbers.rows(bins)
-        return {"text_tokens": tokens, "text_mask": mask, "answer_mask": answer_mask, "number_rows": rows}
+        return text, answer_mask, rows
 
-    def batch(frames: Sequence[tuple[int, EncodedSample]]) -> Sample | None:
+    def batch(frames: Sequence[tuple[int, EncodedSample]]) -> Example[np.ndarray] | None:
         # All texts and then all pictures: by turns, each would push the other out of the processor's caches.
-        texts = [text(*words) for words in prompts_and_answers([frame for _, frame in frames], encoding, scale)]
+        texts = [words(*one) for one in prompts_and_answers([frame for _, frame in frames], encoding, scale)]
         rgb = np.empty((len(frames), config.image_size, config.image_size, 3), np.uint8)
-        cameras: dict[int, Sample] = {}
+        views: dict[int, tuple[np.ndarray, Camera[np.ndarray]]] = {}
         for row, (number, frame) in enumerate(frames):
             try:
                 rng = np.random.default_rng([seed, number])
-                cameras[row] = write_picture(frame, rng, config, encoding.use_points, rgb[row])
+                views[row] = write_picture(frame, rng, config, encoding.use_points, rgb[row])
             except DataError as error:
                 if not config.skip_bad:
                     raise
                 leave_out((frame.where, str(error).removeprefix(f"{frame.where}: ")))
-        if not cameras:
+        if not views:
             return None
         chosen = list(range(len(frames)))
-        if len(cameras) < len(frames):
-            chosen = [min(cameras, key=lambda other: abs(other - row)) for row in chosen]
+        if len(views) < len(frames):
+            chosen = [min(views, key=lambda other: abs(other - row)) for row in chosen]
             rgb = rgb[chosen]
-        samples = [{**cameras[row], **texts[row]} for row in chosen]
-        return {"rgb": rgb, **{name: np.stack([sample[name] for sample in samples]) for name in samples[0]}}
+        rows = [(views[row], texts[row]) for row in chosen]
+        (depth, camera), (text, answer_mask, number_rows) = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+        return Example(Picture(rgb, depth, camera), text, answer_mask, number_rows)
 
     return batch
 
@@ -98,8 +101,8 @@ def targets_of(frames: Sequence[EncodedSample], encoding: EncodingConfig, scale:
 
 def write_picture(
     frame: EncodedSample, rng: np.random.Generator, config: OxeConfig, use_points: bool, rgb: np.ndarray
-) -> Sample:
-    """Writes `rgb` (S, S, 3); returns depth, intrinsics and world_from_camera, which a crop moves along."""
+) -> tuple[Float[np.ndarray, "h w"], Camera[np.ndarray]]:
+    """Writes `rgb` (S, S, 3); returns depth and camera, which a crop moves along."""
     picture = decode_image(frame.picture, frame.format, frame.where)
     height, width = picture.shape[:2]
     box = random_box(rng, height, width, config.crop) if config.crop < 1 else (0, 0, height, width)
@@ -117,4 +120,4 @@ def write_picture(
         check_depth(counts * np.float32(camera.depth_unit), frame.where)
         depth = crop_resize(counts, box, config.image_size, nearest=True) * np.float32(camera.depth_unit)
         intrinsics, pose = crop_intrinsics(camera.intrinsics, box, config.image_size), camera.world_from_camera
-    return {"depth": depth, "intrinsics": intrinsics, "world_from_camera": pose}
+    return depth, Camera(intrinsics, pose)

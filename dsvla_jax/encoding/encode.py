@@ -1,11 +1,12 @@
-"""The one path from an observation and words to the network's inputs."""
+"""The one path from a picture and words to the network's inputs."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Bool, Float, Int
 
 from dsvla_jax.encoding.alignment import AlignmentMode, align_to_patches
 from dsvla_jax.encoding.codec import PoseCodec
@@ -17,7 +18,7 @@ from dsvla_jax.encoding.prompts import POSITION_SLOT, Style, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.ranges import FINITE, at_least, check_fields, require, require_box
-from dsvla_jax.types import Array, Observation
+from dsvla_jax.types import Array, Camera, Example, ModelInputs, Picture, RobotState, Text
 
 # The normalisation CLIP was trained with (https://github.com/openai/CLIP).
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
@@ -113,43 +114,58 @@ class EncodingConfig:
         return self.points.num_tokens if self.use_points else 0
 
 
-def encode_observation(observation: Observation, config: EncodingConfig) -> dict[str, Array]:
-    """The picture's part of ModelInputs, for a batch.
+def model_inputs(picture: Picture[Array], text: Text[Array], config: EncodingConfig) -> ModelInputs[Array]:
+    """Encodes a batch of pictures and texts for the network. Pictures may have any size; their cameras describe it."""
+    image = normalize_image(picture.rgb, config.image_size)
+    if config.use_points:
+        tokens, _, patches = cloud_tokens(picture, config)
+    else:
+        tokens = jnp.zeros((len(image), 0, config.points.width), jnp.float32)
+        patches = jnp.zeros((len(image), 0), jnp.int32)
+    return ModelInputs(image, tokens, patches, text)
 
-    Args:
-        observation: every leaf with a leading batch axis B. The image may have any size; its camera describes it.
 
-    Returns:
-        image: float32 (B, S, S, 3), normalised as CLIP's. point_tokens: float32 (B, G, D3).
-        point_patches: int32 (B, G). Keyword arguments of ModelInputs.
+def cloud_tokens(
+    picture: Picture[Array], config: EncodingConfig
+) -> tuple[Float[Array, "b g d"], Float[Array, "b g 3"], Int[Array, "b g"]]:
+    """Makes the 3D tokens of a batch.
+
+    Returns the tokens, their centres (metres, world frame), and the image patches that they are aligned with.
     """
-    image = normalize_image(observation.rgb, config.image_size)
-    if not config.use_points:
-        batch = image.shape[0]
-        tokens = jnp.zeros((batch, 0, config.points.width), jnp.float32)
-        return {"image": image, "point_tokens": tokens, "point_patches": jnp.zeros((batch, 0), jnp.int32)}
-    tokens, _, patches = cloud_tokens(observation, config)
-    return {"image": image, "point_tokens": tokens, "point_patches": patches}
-
-
-def cloud_tokens(observation: Observation, config: EncodingConfig) -> tuple[Array, Array, Array]:
-    """The 3D tokens of a batch: tokens float32 (B, G, D3), their centres (B, G, 3), metres, world frame, and the image
-    patches int32 (B, G) that they are aligned with."""
-    height, width = observation.depth.shape[1:]
+    height, width = picture.depth.shape[1:]
     config.require_points(height, width)
     cloud = jax.vmap(
         lambda depth, camera: cloud_from_depth(
             depth, camera, config.workspace_low, config.workspace_high, config.stride
         )
     )
-    points, valid = cloud(observation.depth, observation.camera)
+    points, valid = cloud(picture.depth, picture.camera)
     chosen = farthest_point_sample(points, valid, config.points.num_points)
     points = jnp.take_along_axis(points, chosen[..., None], axis=1)
     tokens, centers = jax.vmap(lambda one: tokenize_points(one, config.points))(points)
     patches = jax.vmap(lambda one, camera: align_to_patches(one, camera, height, width, config.grid, config.alignment))(
-        centers, observation.camera
+        centers, picture.camera
     )
     return tokens, centers, patches
+
+
+def example_spec(config: EncodingConfig, batch: int, height: int, width: int) -> Example[jax.ShapeDtypeStruct]:
+    """The shapes and dtypes of a batch of examples with pictures of (height, width)."""
+
+    def spec(dtype: DTypeLike, *shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((batch, *shape), dtype)
+
+    length = config.max_text_length
+    return Example(
+        Picture(
+            spec(jnp.uint8, height, width, 3),
+            spec(jnp.float32, height, width),
+            Camera(spec(jnp.float32, 3, 3), spec(jnp.float32, 4, 4)),
+        ),
+        Text(spec(jnp.int32, length), spec(jnp.bool_, length)),
+        answer_mask=spec(jnp.bool_, length),
+        number_rows=spec(jnp.int32, length),
+    )
 
 
 def normalize_image(rgb: ArrayLike, size: int) -> Array:
@@ -166,17 +182,14 @@ def normalize_image(rgb: ArrayLike, size: int) -> Array:
 def build_prompt(
     config: EncodingConfig,
     instruction: str,
-    pose: ArrayLike,
-    gripper_open: ArrayLike,
-    keypoints: ArrayLike | None,
+    robot: RobotState[np.ndarray],
+    keypoints: Float[np.ndarray, "a 3"] | None,
 ) -> str:
-    """The question of one step, on the host.
+    """Writes the question of one step, on the host.
 
-    Args:
-        pose: float (A, 7). gripper_open: float (A,). The robot's own state.
-        keypoints: float (A, 3), metres, world frame: the active keypoint of each arm, or None where there is none.
+    keypoints: metres, world frame: the active keypoint of each arm, or None if there is none.
     """
-    state = config.codec.encode(np.asarray(pose), np.asarray(gripper_open))
+    state = config.codec.encode(robot.pose, robot.gripper_open)
     integers = None
     if config.use_keypoints and keypoints is not None:
         integers = config.codec.encode_position(np.asarray(keypoints))
@@ -185,17 +198,16 @@ def build_prompt(
 
 def encode_text(
     tokenizer: Tokenizer, prompt: str, answer: str | None, max_length: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Prompt and answer as padded tokens, on the host.
+) -> tuple[Text[np.ndarray], Bool[np.ndarray, " t"]]:
+    """Encodes a prompt and its answer as padded tokens, on the host.
 
-    The prompt's tokens do not depend on its answer; raises UserError where the tokenizer would make them.
+    The prompt's tokens do not depend on its answer; raises UserError if the tokenizer would make them.
 
     Args:
         answer: None at inference; then the text ends with the prompt, without the end-of-sequence token.
 
     Returns:
-        tokens: int32 (T,), begin, prompt [, answer, end], padding. mask: bool (T,), False on padding.
-        answer_mask: bool (T,), True on the answer's tokens and its end: what the policy is to write.
+        The text, and a mask that is True on the answer's tokens and its end: what the policy is to write.
     """
     if answer is None:
         asked, answered = tokenizer.encode(prompt), []
@@ -212,4 +224,4 @@ def encode_text(
     padded = np.full(max_length, tokenizer.pad_id, np.int32)
     padded[:length] = tokens
     place = np.arange(max_length)
-    return padded, place < length, (place >= start) & (place < length)
+    return Text(padded, place < length), (place >= start) & (place < length)

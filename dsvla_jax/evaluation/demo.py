@@ -100,19 +100,20 @@ def describe(policy: Policy, seen: Observation, instruction: str, near: np.ndarr
     """One turn of the only robot of a batch. near: the active keypoint of each arm, (A, 3)."""
     encoding: EncodingConfig = policy.config.encoding
     one = jax.tree.map(lambda x: np.asarray(x)[0], seen)
-    picture, size = cv2.resize(one.rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST), one.rgb.shape[:2]
+    rgb, camera, size = one.picture.rgb, one.picture.camera, one.picture.rgb.shape[:2]
+    picture = enlarged = cv2.resize(rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST)
     if encoding.use_points:
-        centers, patches = (np.asarray(x)[0] for x in jax.jit(cloud_tokens, static_argnums=1)(seen, encoding)[1:])
-        picture = draw_tokens(one.rgb, centers, patches, one.camera, encoding.grid)
+        tokens = jax.jit(cloud_tokens, static_argnums=1)(seen.picture, encoding)
+        centers, patches = (np.asarray(x)[0] for x in tokens[1:])
+        picture = draw_tokens(rgb, centers, patches, camera, encoding.grid)
     target = np.asarray(decision.action.pose)[0]
-    enlarged = cv2.resize(one.rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST)
     scale = np.diag([SHOWN / size[1], SHOWN / size[0], 1.0]).astype(np.float32)
-    marked = mark_targets(enlarged, target[:, :3], one.camera.replace(intrinsics=scale @ one.camera.intrinsics))
+    marked = mark_targets(enlarged, target[:, :3], dataclasses.replace(camera, intrinsics=scale @ camera.intrinsics))
     bins = parse_answer(decision.texts[0], len(target), encoding.style)
     return Step(
         tokens=png_data(picture),
-        target=png_data(draw_keypoints(marked, near, one.camera, size) if encoding.use_keypoints else marked),
-        prompt=build_prompt(encoding, instruction, one.pose, one.gripper_open, near),
+        target=png_data(draw_keypoints(marked, near, camera, size) if encoding.use_keypoints else marked),
+        prompt=build_prompt(encoding, instruction, one.robot, near),
         answer=decision.texts[0],
         numbers=[
             [(name, str(bins[arm, i]), float(np.exp(decision.log_probs[0, arm, i]))) for i, name in enumerate(NUMBERS)]

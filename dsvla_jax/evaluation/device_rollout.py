@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from dsvla_jax.encoding.encode import encode_observation
+from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.encoding.prompt_table import instruction_tokens, make_prompt_table, write_prompts
@@ -22,7 +22,7 @@ from dsvla_jax.model.vla import VLA
 from dsvla_jax.policy import Policy, PolicyConfig
 from dsvla_jax.sim.episode import Environment
 from dsvla_jax.sim.physics import SimState, jit_with_mjx
-from dsvla_jax.types import Array, ModelInputs
+from dsvla_jax.types import Array, Text
 
 
 @struct.dataclass
@@ -68,13 +68,14 @@ def device_loop(
         mjx_model: Any, variables: Variables, state: SimState, active: Array, text: tuple[Array, Array]
     ) -> tuple[SimState, Array]:
         observation = environment.observe(state)
-        batch = observation.pose.shape[0]
-        integers = encoding.codec.encode(observation.pose, observation.gripper_open).reshape(batch, -1)
+        robot = observation.robot
+        batch = robot.pose.shape[0]
+        integers = encoding.codec.encode(robot.pose, robot.gripper_open).reshape(batch, -1)
         if encoding.use_keypoints:
             near = encoding.codec.encode_position(active).reshape(batch, -1)
             integers = jnp.concatenate([integers, near], axis=1)
-        tokens, mask = write_prompts(table, text[0], text[1], integers, size, tokenizer.pad_id)
-        inputs = ModelInputs(**encode_observation(observation, encoding), text_tokens=tokens, text_mask=mask)
+        prompts = Text(*write_prompts(table, text[0], text[1], integers, size, tokenizer.pad_id))
+        inputs = model_inputs(observation.picture, prompts, encoding)
         answer = decode_actions(VLA(config.model), variables, inputs, grammar, decoding, None).integers
         return environment.execute_in_mjx(mjx_model, state, encoding.codec.decode(answer)), answer
 

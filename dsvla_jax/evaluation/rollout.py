@@ -140,10 +140,10 @@ def run_episodes(
         keypoints = (keypoints + noise[:, :, : keypoints.shape[2]]).astype(np.float32)
         problems = [old or new for old, new in zip(problems, missing, strict=True)]
         over |= np.array([bool(problem) for problem in problems])
-        latched = np.asarray(jax.vmap(advance_latch)(latched, observation.pose[..., :3], keypoints))
+        latched = np.asarray(jax.vmap(advance_latch)(latched, observation.robot.pose[..., :3], keypoints))
         active = np.asarray(jax.vmap(jax.vmap(active_keypoint))(latched, keypoints))
         action, texts = act(observation, instructions, active)
-        rgb, positions = np.asarray(observation.rgb), np.asarray(action.pose)[..., :3]
+        rgb, positions = np.asarray(observation.picture.rgb), np.asarray(action.pose)[..., :3]
         for i in np.flatnonzero(~over).tolist():
             seen[i].append(rgb[i])
             answers[i].append(texts[i])
@@ -151,7 +151,7 @@ def run_episodes(
         state = environment.execute(state, action)
         over |= has_ended(state)
         on_keyframe(done, int(np.sum(environment.success(state))))
-    last, reasons = np.asarray(environment.observe(state).rgb), failure_reasons(environment, state)
+    last, reasons = np.asarray(environment.observe(state).picture.rgb), failure_reasons(environment, state)
     reasons = [problem or reason for problem, reason in zip(problems, reasons, strict=True)]
     return [
         Ending(

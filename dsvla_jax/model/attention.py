@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-Array = jax.Array
+from dsvla_jax.types import Array
 
 # A finite "minus infinity": a row that is masked everywhere (padding) then gives a mean instead of NaN.
 MASKED = -1e30

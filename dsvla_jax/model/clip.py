@@ -14,8 +14,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.layers import KERNEL_INIT, layer_norm, over_layers, residual_init
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
-
-Array = jax.Array
+from dsvla_jax.types import Array
 
 
 def quick_gelu(x: Array) -> Array:

@@ -29,8 +29,9 @@ from dsvla_jax.model.number_tree import (
     stack_choices,
     stack_numbers,
 )
-from dsvla_jax.model.vla import VLA
-from dsvla_jax.types import Array, ModelInputs
+from dsvla_jax.model.variables import Variables
+from dsvla_jax.model.vla import VLA, extend, lm_head, prefill
+from dsvla_jax.types import Array, ModelInputs, Text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,8 +112,8 @@ class _Pass:
 
 def decode_actions(
     model: VLA,
-    variables: Any,
-    inputs: ModelInputs,
+    variables: Variables,
+    inputs: ModelInputs[Array],
     grammar: AnswerGrammar,
     decoding: Decoding = GREEDY,
     key: Array | None = None,
@@ -139,10 +140,9 @@ def decode_actions(
     offsets = np.cumsum([0, *kept])
     room = max(offset + len(tree.branches.tokens) for offset, tree in zip(offsets, trees, strict=True))
 
-    prefilled: Any = model.apply(put_together(variables), inputs, int(room), method="prefill")
-    root, cache = prefilled
+    root, cache = prefill(model, put_together(variables), inputs, int(room))
     before = cache.keys.shape[3] - room
-    lengths = before - inputs.text_tokens.shape[1] + inputs.text_mask.sum(axis=1).astype(jnp.int32)
+    lengths = before - inputs.text.tokens.shape[1] + inputs.text.mask.sum(axis=1).astype(jnp.int32)
     if decoding.samples > 1:
         root, cache, lengths = _repeat((root, cache, lengths), decoding.samples)
     batch = len(lengths)
@@ -151,7 +151,7 @@ def decode_actions(
     written = _Written(*(jnp.zeros((batch, len(trees)), dtype) for dtype in (jnp.int32, jnp.float32, jnp.float32)))
 
     def choose(written: _Written, slot: int | Array, hidden: Array, tree: NumberTree) -> _Written:
-        logits: Any = model.apply(put_together(variables), hidden, tree.choices.tokens, method="lm_head")
+        logits = lm_head(model, put_together(variables), hidden, tree.choices.tokens)
         log_probs = _admitted(log_probabilities(logits, tree.choices), written, slot, tree.numbers)
         index = _choose(log_probs, tree.numbers, decoding, keys, slot)[:, None]
         entropy = -jnp.where(jnp.isfinite(log_probs), jnp.exp(log_probs) * log_probs, 0.0).sum(axis=-1)
@@ -204,7 +204,7 @@ def make_decoder(model: VLA, grammar: AnswerGrammar, decoding: Decoding = GREEDY
 
 def _extend(
     model: VLA,
-    variables: Any,
+    variables: Variables,
     read: _Read,
     index: int | Array,
     number: Array,
@@ -234,10 +234,8 @@ def _extend(
     )  # (B, W + C + F, W + C + F)
     mask = jnp.broadcast_to(read.valid[:, None], (*tokens.shape, read.valid.shape[1]))
     mask = jax.lax.dynamic_update_slice_in_dim(mask, among, index, axis=2)
-    extended: Any = model.apply(
-        put_together(variables), tokens, read.lengths[:, None] + behind, mask, read.cache, index, method="extend"
-    )
-    x, cache = extended
+    positions = read.lengths[:, None] + behind
+    x, cache = extend(model, put_together(variables), tokens, positions, mask, read.cache, index)
     valid = jax.lax.dynamic_update_slice_in_dim(read.valid, counts, index, axis=1)
     return x, _Read(cache, valid, read.lengths + length + len(template))
 
@@ -318,7 +316,7 @@ def _append(inputs: ModelInputs, tokens: np.ndarray) -> ModelInputs:
     count = tokens.shape[0]
     if count == 0:
         return inputs
-    text = jnp.pad(inputs.text_tokens, ((0, 0), (0, count)))
-    behind = jnp.arange(text.shape[1])[None] - inputs.text_mask.sum(axis=1, keepdims=True)
+    text = jnp.pad(inputs.text.tokens, ((0, 0), (0, count)))
+    behind = jnp.arange(text.shape[1])[None] - inputs.text.mask.sum(axis=1, keepdims=True)
     text = jnp.where((behind >= 0) & (behind < count), jnp.asarray(tokens)[jnp.clip(behind, 0, count - 1)], text)
-    return dataclasses.replace(inputs, text_tokens=text, text_mask=behind < count)
+    return dataclasses.replace(inputs, text=Text(text, behind < count))

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 from flax import struct, traverse_util
 
 from dsvla_jax.model.variables import Variables
-
-Array = jax.Array
+from dsvla_jax.types import Array
 
 
 @struct.dataclass

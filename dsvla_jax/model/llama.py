@@ -16,8 +16,7 @@ from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.layers import over_layers, rematerialised, residual_init
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
-
-Array = jax.Array
+from dsvla_jax.types import Array
 
 
 @struct.dataclass

@@ -17,8 +17,7 @@ from flax import traverse_util
 from dsvla_jax.model.config import LoraConfig
 from dsvla_jax.model.layers import KERNEL_INIT, Initializer
 from dsvla_jax.model.quantize import SCALE, dequantize
-
-Array = jax.Array
+from dsvla_jax.types import Array
 
 
 def _adapter_init(kind: str) -> Initializer:

@@ -6,11 +6,10 @@ Symmetric, one scale for each output of a layer, no calibration ("absmax"; Dettm
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from flax import traverse_util
 
-Array = jax.Array
+from dsvla_jax.types import Array
 
 KERNEL, SCALE = "kernel", "kernel_scale"
 TOWERS = ("vision", "language")

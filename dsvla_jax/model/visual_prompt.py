@@ -7,7 +7,6 @@ gave it. Parameters have the names of those works. What a layer does with its pr
 import dataclasses
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
@@ -15,8 +14,7 @@ from dsvla_jax.model.layers import KERNEL_INIT, layer_norm, over_layers
 from dsvla_jax.model.llama import DecoderBlock, LayerPrompts, PromptTokens, RMSNorm, rotary_tables
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
-
-Array = jax.Array
+from dsvla_jax.types import Array
 
 
 def visual_blocks_config(config: ModelConfig) -> ModelConfig:

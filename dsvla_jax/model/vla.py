@@ -3,7 +3,7 @@
 Visual tokens enter LLaMA as a prefix to the text, or as prompts of its layers (``ModelConfig.fusion``).
 """
 
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -16,10 +16,9 @@ from dsvla_jax.model.layers import KERNEL_INIT, layer_norm
 from dsvla_jax.model.llama import KVCache, LayerPrompts, Llama, PromptTokens
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.quantize import quantize
+from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.visual_prompt import VisualPrompt
-from dsvla_jax.types import ModelInputs
-
-Array = jax.Array
+from dsvla_jax.types import Array, ModelInputs, Text
 
 # Shortest and longest wavelength of the number embeddings, in integers. The shortest tells neighbours apart, the
 # longest is twice the span of all numbers (-100..200), so that its phase never repeats.
@@ -65,7 +64,7 @@ class VLA(nn.Module):
         """Hidden states (B, T - text_from, width) of the text positions from ``text_from`` on."""
         x, positions, prompts = self._sequence(inputs)
         mask = positions[:, :, None] >= positions[:, None, :]
-        first_row = x.shape[1] - inputs.text_tokens.shape[1] + text_from
+        first_row = x.shape[1] - inputs.text.tokens.shape[1] + text_from
         return self.language(x, positions, mask, prompts=prompts, first_row=first_row)[0]
 
     def lm_head(self, hidden: Array, tokens: np.ndarray | Array | None = None) -> Array:
@@ -89,8 +88,8 @@ class VLA(nn.Module):
         cache = KVCache.empty(self.config, batch, length + more_slots)
         mask = positions[:, :, None] >= jnp.arange(length + more_slots)[None, None, :]
         x, cache = self._continue(x, positions, mask, cache, 0, prompts)
-        text_lengths = inputs.text_mask.sum(axis=1)
-        last = length - inputs.text_tokens.shape[1] + text_lengths - 1
+        text_lengths = inputs.text.mask.sum(axis=1)
+        last = length - inputs.text.tokens.shape[1] + text_lengths - 1
         return jnp.take_along_axis(x, last[:, None, None], axis=1)[:, 0], cache
 
     def extend(
@@ -109,12 +108,36 @@ class VLA(nn.Module):
 
     def _sequence(self, inputs: ModelInputs) -> tuple[Array, Array, tuple[PromptTokens, LayerPrompts] | None]:
         """What the language model reads: (B, T', width), its positions (1, T'), and the visual prompts if any."""
-        visual, x, prompts = self.encode_vision(inputs), self.language.embed(inputs.text_tokens), None
+        visual, x, prompts = self.encode_vision(inputs), self.language.embed(inputs.text.tokens), None
         if isinstance(self.projector, VisualPrompt):
             prompts = self.projector(visual, inputs.point_patches)
         else:
             x = jnp.concatenate([self.projector(visual), x], axis=1)
         return x, jnp.arange(x.shape[1])[None], prompts
+
+
+def prefill(model: VLA, variables: Variables, inputs: ModelInputs[Array], more_slots: int) -> tuple[Array, KVCache]:
+    """Runs `VLA.prefill`."""
+    return cast(tuple[Array, KVCache], model.apply(variables, inputs, more_slots, method=VLA.prefill))
+
+
+def extend(
+    model: VLA,
+    variables: Variables,
+    tokens: Array,
+    positions: Array,
+    mask: Array,
+    cache: KVCache,
+    index: Array | int,
+) -> tuple[Array, KVCache]:
+    """Runs `VLA.extend`."""
+    extended = model.apply(variables, tokens, positions, mask, cache, index, method=VLA.extend)
+    return cast(tuple[Array, KVCache], extended)
+
+
+def lm_head(model: VLA, variables: Variables, hidden: Array, tokens: np.ndarray | Array | None = None) -> Array:
+    """Runs `VLA.lm_head`."""
+    return cast(Array, model.apply(variables, hidden, tokens, method=VLA.lm_head))
 
 
 def number_embeddings(values: Array, width: int) -> Array:
@@ -142,8 +165,7 @@ def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Arra
         image=jnp.zeros((1, vision.image_size, vision.image_size, 3)),
         point_tokens=jnp.zeros((1, 1, vision.width)),
         point_patches=jnp.zeros((1, 1), jnp.int32),
-        text_tokens=jnp.zeros((1, 2), jnp.int32),
-        text_mask=jnp.ones((1, 2), bool),
+        text=Text(jnp.zeros((1, 2), jnp.int32), jnp.ones((1, 2), bool)),
     )
     variables = dict(jax.jit(VLA(config).init)(key, inputs))
     if number_values is not None:

@@ -58,13 +58,14 @@ class SegmentationKeypoints:
         """float32 (B, A, K, 3), and for each episode why it has none; the keypoints of such a one are zeros."""
         if self._refresh or not self._masks.size:
             self._masks = object_masks(self._environment, state)
-        rgb, depth = np.asarray(observation.rgb), np.asarray(observation.depth)
+        picture = observation.picture
+        rgb, depth = np.asarray(picture.rgb), np.asarray(picture.depth)
         most = max(len(arm) for arm in self._arms[0])
         points = np.zeros((len(rgb), self._environment.num_arms, most, 3), np.float32)
         problems = [""] * len(rgb)
         for i, (tracker, arms) in enumerate(zip(self._trackers, self._arms, strict=True)):
             try:
-                camera = jax.tree.map(lambda x, i=i: x[i], observation.camera)
+                camera = jax.tree.map(lambda x, i=i: x[i], picture.camera)
                 points[i] = tracker.keypoints(rgb[i], depth[i], camera, arms)
             except KeypointsNotFound as problem:
                 problems[i] = str(problem)

@@ -9,31 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding
 
-from dsvla_jax.encoding.encode import encode_observation
+from dsvla_jax.encoding.encode import example_spec, model_inputs
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
 from dsvla_jax.experiment import Experiment
-from dsvla_jax.model.decode import decode_actions
+from dsvla_jax.model.decode import Decoded, decode_actions
 from dsvla_jax.model.partition import shardings
-from dsvla_jax.model.variables import join_variables
+from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.hlo import program_cost
 from dsvla_jax.training.chips import Chip, Slice
 from dsvla_jax.training.flops import prefill_flops, training_flops
 from dsvla_jax.training.sharding import batch_part, batch_sharding, make_mesh
-from dsvla_jax.training.state import (
-    initial_state,
-    jit_train_step,
-    make_optimizer,
-    make_train_step,
-    observation_from_batch,
-)
-from dsvla_jax.types import ModelInputs
+from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.types import Array, Example, Picture, Text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,22 +92,21 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
     batch_part(mesh, experiment.batch_size)
     state, frozen, _ = abstract_state(experiment, mesh)
     grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
-    names = ("rgb", "depth", "intrinsics", "world_from_camera", "text_tokens", "text_mask")
-    batch = {name: leaf for name, leaf in abstract_batch(experiment, mesh).items() if name in names}
+    batch = abstract_batch(experiment, mesh)
+    asked = (batch.picture, batch.text)
 
-    def decode(trainable: Any, frozen: Any, batch: Any) -> Any:
+    def decode(trainable: Variables, frozen: Variables, picture: Picture[Array], text: Text[Array]) -> Decoded:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
-            picture = encode_observation(observation_from_batch(batch), experiment.encoding)
-            inputs = ModelInputs(**picture, text_tokens=batch["text_tokens"], text_mask=batch["text_mask"])
+            inputs = model_inputs(picture, text, experiment.encoding)
             return decode_actions(VLA(experiment.model), join_variables(trainable, frozen), inputs, grammar)
 
     held = {
         "frozen base": bytes_on_a_device(frozen),
         "trainable": bytes_on_a_device(state.trainable),
-        "batch": bytes_on_a_device(batch),
+        "batch": bytes_on_a_device(asked),
     }
     counted = sum(prefill_flops(experiment).values()) * examples
-    lowered = jax.jit(decode).lower(state.trainable, frozen, batch)
+    lowered = jax.jit(decode).lower(state.trainable, frozen, *asked)
     return _plan("decoding", lowered, where, mesh, examples, held, counted)
 
 
@@ -195,27 +187,15 @@ def abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[Any, Any, Any]:
     return *_placed((state, frozen), shardings((state, frozen), mesh)), optimizer
 
 
-def abstract_batch(experiment: Experiment, mesh: Mesh, picture: tuple[int, int] | None = None) -> dict[str, Any]:
-    """The arrays of a batch (see `data_pipelines.samples`) as shapes with shardings.
+def abstract_batch(
+    experiment: Experiment, mesh: Mesh, picture: tuple[int, int] | None = None
+) -> Example[jax.ShapeDtypeStruct]:
+    """Returns a batch of examples as shapes with shardings.
 
     picture: height and width, those of simulated demonstrations if not given.
     """
     size = experiment.data.image_size
-    picture = picture or (size, size)
-    text = experiment.encoding.max_text_length
-    leaves = {
-        "rgb": ((*picture, 3), jnp.uint8),
-        "depth": (picture, jnp.float32),
-        "intrinsics": ((3, 3), jnp.float32),
-        "world_from_camera": ((4, 4), jnp.float32),
-        "text_tokens": ((text,), jnp.int32),
-        "text_mask": ((text,), jnp.bool_),
-        "answer_mask": ((text,), jnp.bool_),
-        "number_rows": ((text,), jnp.int32),
-    }
-    batch = {
-        name: jax.ShapeDtypeStruct((experiment.batch_size, *shape), dtype) for name, (shape, dtype) in leaves.items()
-    }
+    batch = example_spec(experiment.encoding, experiment.batch_size, *(picture or (size, size)))
     return _placed(batch, jax.tree.map(lambda _: batch_sharding(mesh), batch))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.policy import BATCH_SIZES, Policy
-from dsvla_jax.types import TABLE_HEIGHT, Observation
+from dsvla_jax.types import TABLE_HEIGHT, Observation, Picture, RobotState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,13 +19,13 @@ class Question:
     """One robot's turn. observation: NumPy arrays without a batch axis. keypoints: active ones (A, 3), or None."""
 
     instruction: str
-    observation: Observation
+    observation: Observation[np.ndarray]
     keypoints: np.ndarray | None
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(A, H, W): questions of one shape can share a batch."""
-        return (*self.observation.gripper_open.shape, *self.observation.depth.shape)
+        return (*self.observation.robot.gripper_open.shape, *self.observation.picture.depth.shape)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +61,8 @@ def prompt_length(policy: Policy, arms: int, instruction_tokens: int) -> int:
         np.array([*policy.codec.low[:2], policy.codec.high[2], -0.5, -0.5, -0.5, 0.5], np.float32), (arms, 1)
     )
     keypoints = pose[:, :3] if policy.config.wants_keypoints else None
-    _, mask = policy.encode_prompt("", pose, np.ones(arms, np.float32), keypoints)
-    return min(policy.config.encoding.max_text_length, int(mask.sum()) + instruction_tokens)
+    text = policy.encode_prompt("", RobotState(pose, np.ones(arms, np.float32)), keypoints)
+    return min(policy.config.encoding.max_text_length, int(text.mask.sum()) + instruction_tokens)
 
 
 def answer_batch(policy: Policy, questions: Sequence[Question], prompt_tokens: int | None = None) -> list[Answer]:
@@ -82,14 +82,9 @@ def blank_question(arms: int, height: int, width: int) -> Question:
     """A well-formed question about an empty table, for warming up."""
     camera = jax.tree.map(np.asarray, front_camera(height))
     pose = np.tile(np.array([0.3, 0.0, TABLE_HEIGHT + 0.5, 0.0, 1.0, 0.0, 0.0], np.float32), (arms, 1))
-    observation = Observation(
-        rgb=np.zeros((height, width, 3), np.uint8),  # type: ignore[arg-type]
-        depth=np.ones((height, width), np.float32),  # type: ignore[arg-type]
-        camera=camera,
-        pose=pose,  # type: ignore[arg-type]
-        gripper_open=np.ones(arms, np.float32),  # type: ignore[arg-type]
-    )
-    return Question("", observation, pose[:, :3])
+    picture = Picture(np.zeros((height, width, 3), np.uint8), np.ones((height, width), np.float32), camera)
+    robot = RobotState(pose, np.ones(arms, np.float32))
+    return Question("", Observation(picture, robot), pose[:, :3])
 
 
 class MicroBatcher:

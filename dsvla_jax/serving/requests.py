@@ -17,7 +17,7 @@ from dsvla_jax.observation_checks import (
     check_workspace,
     points_in_workspace,
 )
-from dsvla_jax.types import Camera, Observation
+from dsvla_jax.types import Camera, Observation, Picture, RobotState
 
 MAX_KEYPOINTS = 16
 MAX_PROMPT = 1000  # characters
@@ -88,7 +88,7 @@ class Request:
     """
 
     instruction: str
-    observation: Observation
+    observation: Observation[np.ndarray]
     keypoints: np.ndarray | None
     reset: bool
     points: int | None = None
@@ -96,7 +96,7 @@ class Request:
     @property
     def shape(self) -> tuple[int, int, int]:
         """(A, H, W): requests of one shape can be answered together."""
-        return (self.observation.pose.shape[0], *self.observation.depth.shape)  # type: ignore[return-value]
+        return (len(self.observation.robot.pose), *self.observation.picture.rgb.shape[:2])
 
 
 def parse_request(message: Any, expected: Expected) -> Request:
@@ -115,8 +115,9 @@ def check_first_keypoints(request: Request, keypoints: np.ndarray) -> None:
 
     Finds an inverse or foreign world_from_camera. Later, objects may leave the view of a camera that moves.
     """
-    camera, size = request.observation.camera, request.observation.depth.shape
-    if not np.any(request.observation.depth):
+    picture = request.observation.picture
+    camera, size = picture.camera, picture.depth.shape
+    if not np.any(picture.depth):
         return  # neither depth nor camera was sent
     # Filled up with the last, which changes nothing, so that every number of keypoints runs what is compiled already.
     padded = np.pad(keypoints, ((0, 0), (0, max(MAX_KEYPOINTS - keypoints.shape[1], 0)), (0, 0)), "edge")
@@ -164,7 +165,7 @@ def _parse(message: Any, expected: Expected) -> Request:
     _check_inside("pose", pose[:, :3], expected.codec)
     check_poses(pose[None], "request")
     length = np.linalg.norm(pose[:, 3:], axis=-1, keepdims=True)
-    unit_pose: Any = np.concatenate([pose[:, :3], pose[:, 3:] / length], axis=-1)
+    unit_pose = np.concatenate([pose[:, :3], pose[:, 3:] / length], axis=-1)
     gripper_open = _floats(message, "gripper_open", (arms,))
     if wrong := sorted(set(gripper_open.tolist()) - {0.0, 1.0}):
         raise BadRequest(
@@ -179,7 +180,7 @@ def _parse(message: Any, expected: Expected) -> Request:
         if not 1 <= keypoints.shape[1] <= MAX_KEYPOINTS:
             raise BadRequest(f"keypoints: expected {OPTIONAL_FIELDS['keypoints']}, got K = {keypoints.shape[1]}")
         _check_inside("keypoints", keypoints, expected.codec)
-    observation = Observation(rgb=message["rgb"], depth=depth, camera=camera, pose=unit_pose, gripper_open=gripper_open)
+    observation = Observation(Picture(message["rgb"], depth, camera), RobotState(unit_pose, gripper_open))
     return Request(instruction, observation, keypoints, bool(reset), points)
 
 

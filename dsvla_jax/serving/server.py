@@ -304,12 +304,12 @@ class PolicyServer:
 
     def _check_prompt(self, request: Request, keypoints: np.ndarray | None) -> None:
         """Raises BadRequest if the policy does not know a word, or the prompt is longer than what is compiled."""
-        pose, gripper_open = np.asarray(request.observation.pose), np.asarray(request.observation.gripper_open)
+        robot = request.observation.robot
         try:
-            _, mask = self._policy.encode_prompt(request.instruction, pose, gripper_open, keypoints)
+            text = self._policy.encode_prompt(request.instruction, robot, keypoints)
         except ValueError as error:
             raise BadRequest(f"prompt: {error}") from error
-        tokens, most = int(mask.sum()), self._prompt_tokens[len(pose)]
+        tokens, most = int(text.mask.sum()), self._prompt_tokens[len(robot.pose)]
         if tokens > most:
             raise BadRequest(
                 f"prompt: {tokens} tokens with pose and keypoints are more than the {most} that the server is compiled "

@@ -52,7 +52,7 @@ class Session:
         before = np.zeros(shape[0], np.int32)
         if self._progress is not None and not self.begins(request, keypoints):
             before = self._progress.reached
-        positions = np.asarray(request.observation.pose)[:, :3]
+        positions = np.asarray(request.observation.robot.pose)[:, :3]
         reached = np.asarray(advance_latch(before, positions, keypoints))
         active = [active_keypoint(count, row) for count, row in zip(reached, keypoints, strict=True)]
         return np.stack([np.asarray(point) for point in active]), Progress(request.instruction, shape, reached)

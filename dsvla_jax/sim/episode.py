@@ -16,7 +16,7 @@ from dsvla_jax.sim.physics import SimState, Verdict
 from dsvla_jax.sim.scene import build_scene
 from dsvla_jax.sim.shifts import Start, check_shifts, shift
 from dsvla_jax.sim.tasks import StateView, Task, get_task
-from dsvla_jax.types import Action, Array, Camera, Observation
+from dsvla_jax.types import Action, Array, Camera, Observation, Picture, RobotState
 
 MAX_RAYS = 2**21  # cast at once over all episodes: more need gigabytes
 # A pose that no arm reaches: an action that cannot be planned leaves the arms still.
@@ -146,7 +146,7 @@ class Environment:
         """What a policy sees of the B episodes; every field with the batch in front, the camera's too."""
         rgb, depth, _ = self.render(state)
         pose, gripper_open = self.end_effector(state)
-        return Observation(rgb=rgb, depth=depth, camera=state.camera, pose=pose, gripper_open=gripper_open)
+        return Observation(Picture(rgb, depth, state.camera), RobotState(pose, gripper_open))
 
     def render(self, state: SimState) -> tuple[Array, Array, Array]:
         """rgb uint8 (B, H, W, 3), depth float32 (B, H, W) metres, segmentation int32 (B, H, W), geom ids, -1 sky."""

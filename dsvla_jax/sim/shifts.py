@@ -8,6 +8,7 @@
 Each is a pure function (key, start of one episode) -> start; vmap them over episodes.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -152,7 +153,8 @@ def other_view(key: Array, camera: Camera) -> Camera:
     tilt = quaternion_to_matrix(quaternion_from_axis_angle(orbit @ pose[:3, 0], over * TILT))
     turn = tilt @ orbit
     position = MIDDLE + (1 + far * DISTANCE) * (turn @ (pose[:3, 3] - MIDDLE))
-    return camera.replace(world_from_camera=pose.at[:3, :3].set(turn @ pose[:3, :3]).at[:3, 3].set(position))
+    moved = pose.at[:3, :3].set(turn @ pose[:3, :3]).at[:3, 3].set(position)
+    return dataclasses.replace(camera, world_from_camera=moved)
 
 
 def _is_of_task(model: mujoco.MjModel, geom: int) -> bool:

@@ -4,7 +4,7 @@ import contextlib
 import resource
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -12,9 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.types import Array
-
-Batch = Mapping[str, np.ndarray]
+from dsvla_jax.types import Array, Example, named_arrays
 
 
 class SkippedSteps:
@@ -27,9 +25,9 @@ class SkippedSteps:
 
     def __init__(self, folder: Path, limit: int, seen: int):
         self._folder, self._limit, self._seen = folder, limit, seen
-        self._pending: tuple[int, Batch, Array] | None = None
+        self._pending: tuple[int, Example[np.ndarray], Array] | None = None
 
-    def watch(self, step: int, batch: Batch, total: Array) -> None:
+    def watch(self, step: int, batch: Example[np.ndarray], total: Array) -> None:
         """batch: this process's part, on the host. total: int32 (), skipped steps up to and with this one."""
         self.settle()
         self._pending = (step, batch, total)
@@ -46,7 +44,7 @@ class SkippedSteps:
         part = f"-process{jax.process_index()}" if jax.process_count() > 1 else ""
         file = self._folder / f"step-{step:08d}{part}.npz"
         self._folder.mkdir(parents=True, exist_ok=True)
-        np.savez(file, allow_pickle=False, **batch)
+        np.savez(file, allow_pickle=False, **named_arrays(batch))
         told = f"step {step}: loss or gradient was not finite; skipped ({self._seen} so far), its batch is in {file}"
         tqdm.write(told, file=sys.stderr)
         if self._seen > self._limit:

@@ -19,15 +19,17 @@ from dsvla_jax.training.health import Clock, SkippedSteps, memory
 from dsvla_jax.training.metrics import MetricsWriter
 from dsvla_jax.training.signals import StopRequest
 from dsvla_jax.training.state import TrainState
+from dsvla_jax.types import Example
 
-Step = Callable[[TrainState, Mapping[str, np.ndarray]], tuple[TrainState, dict[str, Any]]]
+Step = Callable[[TrainState, Example[np.ndarray]], tuple[TrainState, dict[str, Any]]]
 
 
 class Batches(Protocol):
     """An endless stream of batches whose position can be saved as JSON."""
 
-    def __next__(self) -> Mapping[str, np.ndarray]: ...
+    def __next__(self) -> Example[np.ndarray]: ...
     def get_state(self) -> dict[str, Any]: ...
+    def set_state(self, state: dict[str, Any]) -> None: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +94,7 @@ def train(
                 bar.set_postfix_str("")
                 clock.start()
             else:
-                clock.count(experiment.batch_size, int(batch["text_mask"].sum()) * jax.process_count())
+                clock.count(experiment.batch_size, int(batch.text.mask.sum()) * jax.process_count())
             figures: dict[str, float] = {}
             if is_due(done, experiment.log_every) or done == experiment.steps:
                 numbers = {name: float(value) for name, value in values.items()}

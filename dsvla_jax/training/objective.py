@@ -2,36 +2,34 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from dsvla_jax.encoding.number_targets import NumberTargets
-from dsvla_jax.types import Array
+from dsvla_jax.types import Array, Example
 
 
-def answer_counts(answer_mask: Array, number_rows: Array, targets: NumberTargets) -> tuple[Array, Array]:
-    """How much of (B, T) arrays `answer_loss` takes means over: tokens of answers, and bins in them; 1 for 0."""
-    bins = jnp.asarray(targets.begins)[number_rows[:, 1:]]
-    return jnp.maximum(answer_mask[:, 1:].sum(), 1), jnp.maximum(bins.sum(), 1)
+def answer_counts(batch: Example[Array], targets: NumberTargets) -> tuple[Array, Array]:
+    """Counts what `answer_loss` takes means over: tokens of a batch's answers, and bins in them; 1 for 0."""
+    bins = jnp.asarray(targets.begins)[batch.number_rows[:, 1:]]
+    return jnp.maximum(batch.answer_mask[:, 1:].sum(), 1), jnp.maximum(bins.sum(), 1)
 
 
 def answer_loss(
-    logits: Array,
-    text_tokens: Array,
-    answer_mask: Array,
-    number_rows: Array,
+    logits: Float[Array, "b t v"],
+    batch: Example[Array],
     targets: NumberTargets,
     counts: tuple[Array, Array] | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """Mean cross-entropy over all answer tokens of the batch, each predicted from the token before it.
 
-    logits: float32 (B, T, V). text_tokens: int32 (B, T). answer_mask: bool (B, T), True on answer tokens.
-    number_rows: int32 (B, T), the rows of `targets` on those of them that choose a bin, 0 elsewhere.
+    targets: of the tokenizer and style that the batch was written with; `batch.number_rows` are rows of it.
     counts: `answer_counts` of the whole batch where these examples are a part of it; the sums over its parts are then
         the whole batch's loss and metrics.
     Returns the loss and metrics: token accuracy, and the share of bins that are within one of the target's. Where a
     bin is several tokens, each predicted after the target's own tokens, it counts if every one of them leads to a bin
     within one of the target's; whether the number ends in time shows in the token accuracy only.
     """
-    labels, answer, rows = text_tokens[:, 1:], answer_mask[:, 1:], number_rows[:, 1:]
+    labels, answer, rows = batch.text.tokens[:, 1:], batch.answer_mask[:, 1:], batch.number_rows[:, 1:]
     chooses = rows > 0
     log_probabilities = jax.nn.log_softmax(logits[:, :-1].astype(jnp.float32))
     likelihood = jnp.take_along_axis(log_probabilities, labels[..., None], axis=-1)[..., 0]
@@ -41,7 +39,7 @@ def answer_loss(
         # An accelerator would round float32 factors, and the loss with them, to fewer bits.
         expected = jnp.einsum("btu,btu->bt", offered, weights, precision=jax.lax.Precision.HIGHEST)
         likelihood = jnp.where(chooses, expected, likelihood)
-    count, bins = answer_counts(answer_mask, number_rows, targets) if counts is None else counts
+    count, bins = answer_counts(batch, targets) if counts is None else counts
     loss = -jnp.where(answer, likelihood, 0.0).sum() / count
 
     guess = log_probabilities.argmax(-1)

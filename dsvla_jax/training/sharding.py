@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -11,6 +11,8 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.partition import AXIS_RULES, MESH_AXES
+
+Tree = TypeVar("Tree")
 
 
 def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
@@ -69,7 +71,10 @@ def part_of_process(processes: np.ndarray, process: int) -> tuple[int, int]:
     return parts.index(rows[process]), len(parts)
 
 
-def put_batch(batch: dict[str, np.ndarray], mesh: Mesh) -> dict[str, jax.Array]:
-    """This process's part of a batch as a part of the one array that all processes share, split by its leading axis."""
+def put_batch(batch: Tree, mesh: Mesh) -> Tree:
+    """Makes global arrays of a batch, split by its leading axis, of which this process holds `batch`.
+
+    batch: a pytree of NumPy arrays.
+    """
     sharding = batch_sharding(mesh)
-    return {name: jax.make_array_from_process_local_data(sharding, value) for name, value in batch.items()}
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, leaf), batch)

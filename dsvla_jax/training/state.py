@@ -1,7 +1,7 @@
 """The training step as a pure function, and the state that it carries."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +10,14 @@ import optax
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from dsvla_jax.encoding.encode import EncodingConfig, encode_observation
+from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.partition import constrain, shardings
 from dsvla_jax.model.variables import Variables, join_variables, narrow_frozen, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.objective import answer_counts, answer_loss
-from dsvla_jax.types import Array, Camera, ModelInputs, Observation
+from dsvla_jax.types import Array, Example
 
 
 @struct.dataclass
@@ -36,7 +36,8 @@ class TrainState:
     rng: Array
 
 
-TrainStep = Callable[[TrainState, Variables, dict[str, Array]], tuple[TrainState, dict[str, Array]]]
+Summed = TypeVar("Summed")
+TrainStep = Callable[[TrainState, Variables, Example[Array]], tuple[TrainState, dict[str, Array]]]
 
 
 def initial_state(
@@ -87,20 +88,6 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
     )
 
 
-def observation_from_batch(batch: dict[str, Array]) -> Observation:
-    """The observation part of a batch of samples, leading axis B."""
-    camera = Camera(batch["intrinsics"], batch["world_from_camera"])
-    size = len(batch["rgb"])
-    # Pose and gripper reach the model as text; the picture's own encoding never reads them.
-    return Observation(batch["rgb"], batch["depth"], camera, jnp.zeros((size, 1, 7)), jnp.zeros((size, 1)))
-
-
-def model_inputs(batch: dict[str, Array], config: EncodingConfig) -> ModelInputs:
-    """The network's inputs for a batch of samples."""
-    picture = encode_observation(observation_from_batch(batch), config)
-    return ModelInputs(**picture, text_tokens=batch["text_tokens"], text_mask=batch["text_mask"])
-
-
 def make_train_step(
     experiment: Experiment, model: VLA, optimizer: optax.GradientTransformation, targets: NumberTargets
 ) -> TrainStep:
@@ -111,21 +98,18 @@ def make_train_step(
     targets: of the tokenizer and style that the batches were written with.
     """
 
-    def step(state: TrainState, frozen: Variables, batch: dict[str, Array]):
-        counts = answer_counts(batch["answer_mask"], batch["number_rows"], targets)
+    def step(state: TrainState, frozen: Variables, batch: Example[Array]) -> tuple[TrainState, dict[str, Array]]:
+        counts = answer_counts(batch, targets)
 
-        def part(batch: dict[str, Array]) -> tuple[Variables, dict[str, Array]]:
-            inputs = model_inputs(
-                {name: constrain(value, "batch") for name, value in batch.items()}, experiment.encoding
-            )
+        def part(batch: Example[Array]) -> tuple[Variables, dict[str, Array]]:
+            batch = jax.tree.map(lambda leaf: constrain(leaf, "batch"), batch)
+            inputs = model_inputs(batch.picture, batch.text, experiment.encoding)
 
             def loss_of(trainable: Variables):
                 dropout = jax.random.fold_in(state.rng, state.step)
                 logits = model.apply(join_variables(trainable, frozen), inputs, rngs={"dropout": dropout})
                 assert isinstance(logits, jax.Array)
-                return answer_loss(
-                    logits, inputs.text_tokens, batch["answer_mask"], batch["number_rows"], targets, counts
-                )
+                return answer_loss(logits, batch, targets, counts)
 
             gradients, metrics = jax.grad(loss_of, has_aux=True)(state.trainable)
             return gradients, metrics
@@ -159,7 +143,7 @@ def gradient_norms(gradients: Variables) -> dict[str, Array]:
 def jit_train_step(step: TrainStep, state: TrainState, mesh: Mesh) -> Any:
     """The step compiled for a mesh. The state stays split as it is, and its memory is used for the next one."""
 
-    def on_mesh(state: TrainState, frozen: Variables, batch: dict[str, Array]):
+    def on_mesh(state: TrainState, frozen: Variables, batch: Example[Array]) -> tuple[TrainState, dict[str, Array]]:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
             return step(state, frozen, batch)
 
@@ -167,13 +151,13 @@ def jit_train_step(step: TrainStep, state: TrainState, mesh: Mesh) -> Any:
     return jax.jit(on_mesh, donate_argnums=0, out_shardings=(shardings(state, mesh), everywhere))
 
 
-def _sum_over_parts(part: Callable[[Any], Any], batch: dict[str, Array], count: int) -> Any:
+def _sum_over_parts(part: Callable[[Example[Array]], Summed], batch: Example[Array], count: int) -> Summed:
     """The sum of ``part`` over ``count`` equal parts of a batch, one after the other.
 
     A part takes every count-th example, so that each device has its share of it without any exchange.
     """
     if count == 1:
         return part(batch)
-    parts = {name: value.reshape(-1, count, *value.shape[1:]).swapaxes(0, 1) for name, value in batch.items()}
-    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(part, {name: value[0] for name, value in parts.items()}))
+    parts = jax.tree.map(lambda leaf: leaf.reshape(-1, count, *leaf.shape[1:]).swapaxes(0, 1), batch)
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(part, jax.tree.map(lambda leaf: leaf[0], parts)))
     return jax.lax.scan(lambda total, one: (jax.tree.map(jnp.add, total, part(one)), None), zeros, parts)[0]

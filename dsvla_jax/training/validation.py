@@ -6,15 +6,17 @@ the number counts as the nearest to the right one that it leads to, so that erro
 right if its token is the most probable of all.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Float, Int
 
-from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
+from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM, PoseCodec
+from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.geometry.rotations import rotation_distance
@@ -23,8 +25,7 @@ from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.training.sharding import put_batch
-from dsvla_jax.training.state import model_inputs
-from dsvla_jax.types import Array
+from dsvla_jax.types import Array, HeldOutExample
 
 _GRIPPER = VALUES_PER_ARM - 1
 _BINS = slice(0, _GRIPPER)
@@ -34,28 +35,33 @@ def jit_validation(experiment: Experiment, targets: NumberTargets, mesh: Mesh) -
     """``sums(trainable, frozen, batch)``, compiled for a mesh: by name, a figure's sum over a batch and over how many
     (`mean_errors`).
 
-    The batch is one of training with what `data_pipelines.samples.make_validation_sampler` adds.
+    The batch is of `data_pipelines.samples.make_validation_sampler`.
     """
     model = VLA(experiment.model)
 
-    def sums(trainable: Variables, frozen: Variables, batch: dict[str, Array]) -> dict[str, tuple[Array, Array]]:
+    def sums(trainable: Variables, frozen: Variables, batch: HeldOutExample[Array]) -> dict[str, tuple[Array, Array]]:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
-            batch = {name: constrain(value, "batch") for name, value in batch.items()}
-            inputs = model_inputs(batch, experiment.encoding)
+            batch = jax.tree.map(lambda leaf: constrain(leaf, "batch"), batch)
+            example = batch.example
+            inputs = model_inputs(example.picture, example.text, experiment.encoding)
             logits: Any = model.apply(join_variables(trainable, frozen), inputs)
             one = jnp.ones((), jnp.int32)
-            loss, _ = answer_loss(
-                logits, inputs.text_tokens, batch["answer_mask"], batch["number_rows"], targets, (one, one)
-            )
-            tokens = batch["answer_mask"][:, 1:].sum()
-            return {"loss": (loss, tokens), **number_errors(guess_integers(logits, batch, targets), batch, experiment)}
+            loss, _ = answer_loss(logits, example, targets, (one, one))
+            tokens = example.answer_mask[:, 1:].sum()
+            return {
+                "loss": (loss, tokens),
+                **number_errors(guess_integers(logits, batch, targets), batch, experiment.encoding.codec),
+            }
 
     return jax.jit(sums, out_shardings=NamedSharding(mesh, PartitionSpec()))
 
 
-def guess_integers(logits: Array, batch: Mapping[str, Array], targets: NumberTargets) -> Array:
-    """The most probable answers: logits (B, T, V) of a validation batch -> int32 (B, 2, 8), as `integers` in it."""
-    labels, rows, number_of = (batch[name][:, 1:] for name in ("text_tokens", "number_rows", "number_of"))
+def guess_integers(
+    logits: Float[Array, "b t v"], batch: HeldOutExample[Array], targets: NumberTargets
+) -> Int[Array, "b 2 8"]:
+    """Reads the most probable answers off the logits of a validation batch, as `integers` in it."""
+    labels, rows = batch.example.text.tokens[:, 1:], batch.example.number_rows[:, 1:]
+    number_of = batch.number_of[:, 1:]
     logits = logits[:, :-1]
     offsets = jnp.asarray(targets.offsets)[rows]
     choice = jnp.where(jnp.isfinite(offsets), logits[..., targets.tokens], -jnp.inf).argmax(-1)
@@ -64,21 +70,22 @@ def guess_integers(logits: Array, batch: Mapping[str, Array], targets: NumberTar
     # A gripper status is no bin: it is the other one where a token of it is wrong.
     wrong = (number_of > 0) & (rows == 0) & (logits.argmax(-1) != labels)
 
-    integers = batch["integers"].reshape(len(labels), -1)
+    integers = batch.integers.reshape(len(labels), -1)
     belongs = number_of[:, None] == 1 + jnp.arange(integers.shape[1])[:, None]
     # Of a number without a wrong token this is the first of the text, which belongs to none.
     first = (belongs & (off != 0)[:, None]).argmax(-1)
     guess = (integers + jnp.take_along_axis(off, first, axis=1).astype(jnp.int32)).reshape(-1, 2, VALUES_PER_ARM)
-    status = batch["integers"][..., _GRIPPER]
+    status = batch.integers[..., _GRIPPER]
     flipped = (belongs & wrong[:, None]).any(-1).reshape(-1, 2, VALUES_PER_ARM)[..., _GRIPPER]
     return guess.at[..., _GRIPPER].set(jnp.where(flipped, 1 - status, status))
 
 
-def number_errors(guess: Array, batch: Mapping[str, Array], experiment: Experiment) -> dict[str, tuple[Array, Array]]:
-    """Sums over the arms of a validation batch and how many there are: guess int32 (B, 2, 8) against `integers`."""
-    codec = experiment.encoding.codec
-    target = batch["integers"]
-    there = batch["number_of"].max(axis=1)[:, None] > VALUES_PER_ARM * jnp.arange(2)  # (B, 2)
+def number_errors(
+    guess: Int[Array, "b 2 8"], batch: HeldOutExample[Array], codec: PoseCodec
+) -> dict[str, tuple[Array, Array]]:
+    """Sums the errors of guessed integers over the arms of a validation batch, and counts the arms."""
+    target = batch.integers
+    there = batch.number_of.max(axis=1)[:, None] > VALUES_PER_ARM * jnp.arange(2)  # (B, 2)
     # Whatever real part other than 0 stands beside three zeros, it is no turn.
     rotation = guess[..., QUATERNION_VALUES]
     none = (rotation == 0).all(-1)
@@ -96,7 +103,7 @@ def number_errors(guess: Array, batch: Mapping[str, Array], experiment: Experime
 
 
 def mean_errors(
-    sums: Any, trainable: Variables, frozen: Variables, batches: Iterable[Any], mesh: Mesh
+    sums: Any, trainable: Variables, frozen: Variables, batches: Iterable[HeldOutExample[np.ndarray]], mesh: Mesh
 ) -> dict[str, float]:
     """The means over all batches by name: validation/loss, bin_exact, bin_within_one, position_cm, rotation_degrees,
     gripper.
@@ -105,6 +112,6 @@ def mean_errors(
     """
     total: dict[str, np.ndarray] = {}
     for batch in batches:
-        for name, pair in jax.device_get(sums(trainable, frozen, put_batch(dict(batch), mesh))).items():
+        for name, pair in jax.device_get(sums(trainable, frozen, put_batch(batch, mesh))).items():
             total[name] = total.get(name, 0) + np.asarray(pair, np.float64)
     return {f"validation/{name}": float(value / max(count, 1)) for name, (value, count) in total.items()}
