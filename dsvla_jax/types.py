@@ -19,6 +19,7 @@ the world frame. Quaternions are xyzw, unit length, canonical (qw >= 0). `grippe
 """
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Generic, TypeVar, dataclass_transform
 
 import jax
@@ -42,16 +43,16 @@ def pytree(cls: type[T]) -> type[T]:
     JAX rebuilds pytrees of placeholders, which are no arrays: the rebuilt object skips `__init__`, and with it the
     shape checks that the tests switch on (JAX documentation, "Custom pytrees and initialization").
     """
-    made = dataclasses.dataclass(frozen=True)(cls)
+    made: type[T] = dataclasses.dataclass(frozen=True)(cls)
     names = tuple(field.name for field in dataclasses.fields(made))  # pyright: ignore[reportArgumentType]
 
     def flatten(value: T) -> tuple[tuple[object, ...], None]:
         return tuple(getattr(value, name) for name in names), None
 
-    def flatten_with_keys(value: T) -> tuple[tuple[tuple[jax.tree_util.GetAttrKey, object], ...], None]:
+    def flatten_with_keys(value: T) -> tuple[tuple[tuple[object, object], ...], None]:
         return tuple((jax.tree_util.GetAttrKey(name), getattr(value, name)) for name in names), None
 
-    def unflatten(_: None, children: tuple[object, ...]) -> T:
+    def unflatten(_: None, children: Iterable[object]) -> T:
         value = object.__new__(made)
         for name, child in zip(names, children, strict=True):
             object.__setattr__(value, name, child)
