@@ -39,7 +39,7 @@ from dsvla_jax.report import (
 )
 from dsvla_jax.rollout import Ending, run_task
 from dsvla_jax.rollout_keypoints import Keypoints, keypoint_source
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.shifts import check_shifts
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import Experiment, load_experiment, require_simulated

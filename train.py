@@ -47,7 +47,7 @@ from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
 from dsvla_jax.ranges import require
 from dsvla_jax.rollout import Stopped, run_task
 from dsvla_jax.rollout_keypoints import keypoint_source
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.tasks import TASKS, select_tasks
 from dsvla_jax.training import loop
 from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes

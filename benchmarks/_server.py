@@ -19,7 +19,7 @@ import numpy as np
 import dsvla_jax.policy
 from dsvla_jax.errors import UserError
 from dsvla_jax.serving.batching import Question, answer_batch
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.training.experiment import load_experiment

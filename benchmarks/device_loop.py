@@ -24,7 +24,7 @@ from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.policy import Policy
 from dsvla_jax.rollout import Ending, run_episodes
 from dsvla_jax.rollout_keypoints import Keypoints, keypoint_source
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.training.experiment import load_experiment

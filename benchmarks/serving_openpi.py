@@ -19,7 +19,7 @@ from benchmarks._server import server_process
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.rollout_keypoints import keypoint_source
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import load_experiment

@@ -17,7 +17,7 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
 from dsvla_jax.files import write_picture
 from dsvla_jax.report import film_strip
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import TASKS, Task, select_tasks
 

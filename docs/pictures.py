@@ -8,7 +8,7 @@ from dsvla_jax.command_line import configure_jax
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.files import write_picture
 from dsvla_jax.report import film_strip, mark_targets
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 
 SIZE, COLUMNS = 224, 5

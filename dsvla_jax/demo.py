@@ -24,7 +24,7 @@ from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.report import mark_targets, png_data, require_writable, write_html
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.rollout_keypoints import keypoint_source
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.experiment import load_experiment, require_simulated

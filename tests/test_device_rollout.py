@@ -10,7 +10,7 @@ from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.rollout import run_episodes
 from dsvla_jax.rollout_keypoints import SegmentationKeypoints
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from tests.serving import SIZE, tiny_policy
 

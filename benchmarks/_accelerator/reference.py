@@ -21,7 +21,7 @@ from benchmarks.mjx_agreement import outcomes
 from data_pipelines.samples import suite_tokenizer
 from data_pipelines.sources import open_demonstrations
 from dsvla_jax.command_line import configure_jax
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 
 # Metres an axis by which key poses are missed at most, so that not all episodes succeed.
 MISS = 0.04
