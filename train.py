@@ -49,7 +49,7 @@ from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.planner.preflight import check_step
 from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
 from dsvla_jax.ranges import require
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.tasks import TASKS, select_tasks
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training import loop

@@ -20,7 +20,7 @@ import dsvla_jax.policy
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.serving.batching import Question, answer_batch
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
 

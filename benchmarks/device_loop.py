@@ -25,7 +25,7 @@ from dsvla_jax.evaluation.rollout import Ending, run_episodes
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.perception.simulator import Keypoints, keypoint_source
 from dsvla_jax.policy import Policy
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Array

@@ -28,7 +28,7 @@ from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.training.chips import find_slice
 from dsvla_jax.training.sharding import make_mesh
 
@@ -81,7 +81,7 @@ def main(options: Options) -> int:
         return jax.tree.map(lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree, sharding)
 
     inputs = (
-        placed(environment.mjx_model, everywhere),
+        placed(environment.physics, everywhere),
         placed(variables, shardings(variables, mesh)),
         placed(state, spread),
         placed(jax.eval_shape(environment.keypoints, state), spread),

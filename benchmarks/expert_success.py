@@ -16,7 +16,7 @@ import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.files import write_picture
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.types import Action

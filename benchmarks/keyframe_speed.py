@@ -20,7 +20,7 @@ import tyro
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.sim import controller
 from dsvla_jax.sim.controller import KEYFRAME_STEPS
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action
 
@@ -65,7 +65,7 @@ def c_ratio(name: str) -> float:
     controls = np.asarray(plans.controls, np.float64)  # the same motion, so that contacts cost the same
     models = [model] * BATCH
     bare, ours = fastest(
-        lambda: rollout.rollout(models, data, start, controls), lambda: environment.execute(state, action)
+        lambda: rollout.rollout(models, data, start, controls), lambda: environment.step(state, action)
     )
     print(
         f"{name}: {BATCH} keyframes of {KEYFRAME_STEPS} steps: {1e3 * ours:.0f} ms, bare rollout {1e3 * bare:.0f} ms, "
@@ -84,7 +84,7 @@ def mjx_throughput(name: str, batches: tuple[int, ...]) -> None:
         jax.block_until_ready(state)
         compiled = time.perf_counter() - start
         action = jax.tree.map(jnp.asarray, first_action(environment, state))
-        (seconds,) = fastest(lambda state=state, action=action: environment.execute(state, action), repeats=2)
+        (seconds,) = fastest(lambda state=state, action=action: environment.step(state, action), repeats=2)
         rate = batch * KEYFRAME_STEPS / seconds
         print(f"{name} in MJX, batch {batch:4}: {rate:8.0f} steps/s, first call {compiled:.0f} s", flush=True)
 

@@ -23,7 +23,7 @@ import tyro
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.files import write_picture
 from dsvla_jax.perception.keypoints import Sighting, draw_sightings, locate
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.objects import object_geoms, object_masks
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys

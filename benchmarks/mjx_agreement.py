@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks

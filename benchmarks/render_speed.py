@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.raycast_parity import NO_OPENGL, OpenGLViews
 from dsvla_jax.command_line import configure_jax
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
 

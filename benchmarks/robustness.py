@@ -14,7 +14,7 @@ import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.evaluation.rollout import failure_reasons
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
@@ -68,16 +68,16 @@ def torment(name: str, keyframes: int, physics: Literal["mujoco", "mjx"] = "mujo
     environment, faults = Environment(name, physics), []
     start = environment.reset(episode_keys(0, "validation", name, 0, BATCH))
     for what, action in hostile_actions(environment, start).items():
-        faults += [f"{what}: {field}" for field in non_finite(environment.execute(start, action))]
+        faults += [f"{what}: {field}" for field in non_finite(environment.step(start, action))]
 
     rng, state = np.random.default_rng(0), start
     for _ in range(keyframes):
-        state = environment.execute(state, random_action(rng, environment.num_arms))
+        state = environment.step(state, random_action(rng, environment.num_arms))
     faults += [f"noise: {field}" for field in non_finite(state)]
 
     action = random_action(rng, environment.num_arms)
     broken = start.replace(qvel=jnp.asarray(start.qvel).at[1].set(jnp.nan))
-    healthy, hurt = environment.execute(start, action), environment.execute(broken, action)
+    healthy, hurt = environment.step(start, action), environment.step(broken, action)
     if failure_reasons(environment, hurt)[1] != "the simulation diverged" or np.asarray(hurt.diverged).sum() != 1:
         faults.append("an episode with NaN velocities is not reported as diverged, or not alone")
     others = np.array([0, 2, 3])

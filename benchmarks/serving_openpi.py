@@ -20,7 +20,7 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.evaluation.rollout import run_episodes
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.perception.simulator import keypoint_source
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
 from examples.robot_client import run_episode, simulated_robot

@@ -20,8 +20,8 @@ import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.command_line import fail_with_message
-from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.physics import SimState
+from dsvla_jax.sim.environment import Environment, step
+from dsvla_jax.sim.physics import Physics, SimState
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.training.chips import find_slice
 from dsvla_jax.types import Action, Observation
@@ -42,8 +42,8 @@ def compile_keyframe(name: str, episodes: int, mesh: Mesh) -> dict[str, Any]:
     """Compiles one closed-loop turn; seconds to lower and to compile, and MiB a chip."""
     environment = Environment(name, physics="mjx", image_size=IMAGE_SIZE)
 
-    def turn(mjx_model: Any, state: SimState, action: Action) -> tuple[SimState, Observation]:
-        state = environment.execute_in_mjx(mjx_model, state, action)
+    def turn(physics: Physics, state: SimState, action: Action) -> tuple[SimState, Observation]:
+        state = step(environment.scene, physics, state, action)
         return state, environment.observe(state)
 
     spread, everywhere = NamedSharding(mesh, PartitionSpec("data")), NamedSharding(mesh, PartitionSpec())
@@ -56,7 +56,7 @@ def compile_keyframe(name: str, episodes: int, mesh: Mesh) -> dict[str, Any]:
 
     start = time.perf_counter()
     lowered = jax.jit(turn).lower(
-        placed(environment.mjx_model, everywhere), placed(state, spread), placed(action, spread)
+        placed(environment.physics, everywhere), placed(state, spread), placed(action, spread)
     )
     middle = time.perf_counter()
     memory: Any = lowered.compile().memory_analysis()

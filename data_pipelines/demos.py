@@ -29,7 +29,7 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.files import hold_folder
 from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.ranges import Range, at_least, check_fields, require
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
@@ -120,7 +120,7 @@ class ScriptedExpert:
         for m in range(poses.shape[1]):
             observations.append(jax.tree.map(np.asarray, environment.observe(state)))
             before_success.append(~np.asarray(environment.success(state)))
-            state = environment.execute(
+            state = environment.step(
                 state, Action(pose=jnp.asarray(missed[:, m]), gripper_open=jnp.asarray(grippers[:, m]))
             )
         # Success after so many key poses of the plan, none of them missed: bool (B, M + 1).

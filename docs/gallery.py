@@ -17,7 +17,7 @@ from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.report import film_strip
 from dsvla_jax.files import write_picture
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import TASKS, Task, select_tasks
 
@@ -63,7 +63,7 @@ def draw(name: str) -> Path:
             f"task {name!r}: its expert failed on all {CANDIDATES} episodes; see benchmarks.expert_success."
         )
     best = int(np.argmax(succeeded))
-    frames = [np.asarray(environment.observe(state).rgb[best]) for state in (states[0], states[-1])]
+    frames = [np.asarray(environment.observe(state).picture.rgb[best]) for state in (states[0], states[-1])]
     path = DOCS / "images" / "tasks" / f"{name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_picture(path, film_strip(frames), compression=9)

@@ -21,7 +21,7 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.observation_checks import MAX_DEPTH
 from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.serving.client import PolicyClient
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.types import Action
@@ -81,7 +81,7 @@ class SimulatedRobot:
 
     def move(self, pose: np.ndarray, gripper_open: np.ndarray) -> None:
         action = Action(pose=np.asarray(pose)[None], gripper_open=np.asarray(gripper_open)[None])  # type: ignore[arg-type]
-        self._state = self.environment.execute(self._state, action)
+        self._state = self.environment.step(self._state, action)
 
     def done(self) -> bool:
         return bool(np.asarray(self.environment.success(self._state))[0])

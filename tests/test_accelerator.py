@@ -29,11 +29,11 @@ from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.vla import VLA
-from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.kinematics import inverse_kinematics
+from dsvla_jax.sim.environment import Environment, step
+from dsvla_jax.sim.kinematics import track
 from dsvla_jax.sim.robot import SINGLE_BASE
 from dsvla_jax.sim.scene import build_scene
-from dsvla_jax.sim.shifts import Start, shift
+from dsvla_jax.sim.shifts import SHIFTS, Start, shift
 from dsvla_jax.sim.tasks import get_task
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.types import Observation
@@ -131,12 +131,12 @@ def test_the_largest_programs_can_be_written_for_an_nvidia_gpu():
     tokenizer, optimizer = small_tokenizer("sentencepiece"), make_optimizer(full.optimizer, full.steps)
     state, frozen = jax.eval_shape(partial(initial_state, full, None, optimizer))
     targets = number_rows(tokenizer, full.encoding.style).targets(0.0)
-    step = jit_train_step(make_train_step(full, VLA(full.model), optimizer, targets), state, one_device(full))
+    train_step = jit_train_step(make_train_step(full, VLA(full.model), optimizer, targets), state, one_device(full))
     environment, start = Environment("stack_blocks", "mjx"), starts("stack_blocks", 96, "eval", 1)
     move = jax.tree.map(lambda x: x[:, 0], environment.expert(start))
     for program, arguments in (
-        (step, (state, frozen, train_batch(full, tokenizer, 1))),
-        (jax.jit(environment.execute_in_mjx), (environment.mjx_model, start, move)),
+        (train_step, (state, frozen, train_batch(full, tokenizer, 1))),
+        (jax.jit(partial(step, environment.scene)), (environment.physics, start, move)),
     ):
         text = program.trace(*arguments).lower(lowering_platforms=("cuda",)).as_text()
         assert text.count("dot_general") > 10
@@ -268,20 +268,19 @@ def products(function: Callable[..., Any], *arguments: Any) -> list[Any]:
 
 def test_geometry_asks_accelerators_for_whole_float32_products():
     """Their default keeps ten bits or fewer: millimetres of a point, and a pixel of a picture."""
-    camera, scene = front_camera(32), build_scene(get_task("lamp_on"), clutter=True)
+    camera, scene = front_camera(32), build_scene(get_task("lamp_on"), SHIFTS)
     pose = jnp.array([0.3, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0])
     start = Start(
         scene.initial, camera, jnp.ones(3), jnp.asarray(scene.mj_model.geom_size), jnp.asarray(scene.mj_model.geom_pos)
     )
-    names = ("instance", "position", "background", "camera")
     batch = jax.tree.map(lambda x: x[None], camera)
     seen = Observation(
         jnp.zeros((1, 32, 32, 3), jnp.uint8), jnp.ones((1, 32, 32)), batch, pose[None, None], jnp.ones((1, 1))
     )
     found = {
-        "shifts": products(lambda key, start: shift(names, scene, key, start), jax.random.key(0), start),
+        "shifts": products(lambda key, start: shift(scene, key, start), jax.random.key(0), start),
         "kinematics": products(
-            lambda pose: inverse_kinematics(pose, jnp.zeros(7), jnp.array([*SINGLE_BASE, 0, 0, 0, 1], jnp.float32)),
+            lambda pose: track(pose[None], jnp.zeros(7), jnp.array([*SINGLE_BASE, 0, 0, 0, 1], jnp.float32)),
             pose,
         ),
         "3D tokens": products(lambda seen: cloud_tokens(seen, small_encoding(stride=1)), seen),

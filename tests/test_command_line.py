@@ -10,7 +10,7 @@ import pytest
 
 from dsvla_jax.command_line import DRAWS, configure_jax
 from dsvla_jax.errors import UserError
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 
 ROOT = Path(__file__).parents[1]
 

@@ -445,7 +445,7 @@ def test_recorded_expert_succeeds_again_from_its_seed(tmp_path):
     for m in range(episode.num_frames):
         both = [reader.episode(i) for i in range(2)]
         pose = jnp.stack([x.target_pose[m] for x in both])
-        state = environment.execute(state, Action(pose, jnp.stack([x.target_gripper[m] for x in both])))
+        state = environment.step(state, Action(pose, jnp.stack([x.target_gripper[m] for x in both])))
     assert np.all(environment.success(state))
 
     # The arm was led off the expert's way, by no more than asked for, and is still told the expert's next pose.

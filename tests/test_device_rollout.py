@@ -10,7 +10,7 @@ from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.evaluation.device_rollout import DeviceRollout
 from dsvla_jax.evaluation.rollout import run_episodes
 from dsvla_jax.perception.simulator import SegmentationKeypoints
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from tests.serving import SIZE, tiny_policy
 

@@ -13,7 +13,7 @@ import pytest
 
 from data_pipelines.episodes import EpisodeReader
 from dsvla_jax.geometry.cameras import project
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.types import Camera
 from tests.small import SMALL_RUN
 

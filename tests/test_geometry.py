@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dsvla_jax.geometry.cameras import front_camera, make_camera, project, resize_intrinsics, unproject
 from dsvla_jax.geometry.rotations import (
@@ -17,8 +18,10 @@ from dsvla_jax.geometry.rotations import (
     quaternion_rotate,
     quaternion_slerp,
     quaternion_to_matrix,
+    quaternion_to_rotation_vector,
     quaternion_to_wxyz,
     rotation_distance,
+    rotation_vector_to_quaternion,
 )
 
 
@@ -145,3 +148,15 @@ def test_slerp_takes_the_short_way_at_constant_speed():
     np.testing.assert_allclose(quaternion_slerp(a, a, jnp.full(30, 0.3)), a, atol=1e-6)
     gradient = jax.grad(lambda t: quaternion_slerp(jnp.asarray(a[0]), jnp.asarray(a[0]), t).sum())(0.5)
     assert np.isfinite(gradient)
+
+
+@pytest.mark.parametrize("library", [np, jnp])
+def test_rotation_vectors_are_scipys_in_the_precision_of_the_library(library):
+    quaternions = np.random.default_rng(3).normal(size=(50, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    quaternions = np.concatenate([quaternions, [[0, 0, 0, 1], [1, 0, 0, 0], [1e-9, 0, 0, 1], [0, 0, 0, -1]]])
+    expected, tolerance = Rotation.from_quat(quaternions).as_rotvec(), 1e-14 if library is np else 2e-6
+    vectors = quaternion_to_rotation_vector(library.asarray(quaternions))
+    np.testing.assert_allclose(vectors, expected, atol=tolerance)
+    again = np.asarray(rotation_vector_to_quaternion(vectors))
+    np.testing.assert_allclose(again * np.where(quaternions[:, 3:] < 0, -1, 1), quaternions, atol=tolerance)

@@ -1,4 +1,4 @@
-"""Key poses of recorded demonstrations: PerAct's rule, restated apart from the project's own."""
+"""Keyframes of recorded demonstrations: PerAct's rule, restated apart from the project's own."""
 
 import random
 
@@ -57,7 +57,7 @@ def keyframes(gripper, still):
         ("o", ".", []),
     ],
 )
-def test_key_poses_are_peracts(gripper, still, expected):
+def test_keyframes_are_peracts(gripper, still, expected):
     assert keyframes(gripper, still) == expected
 
 
@@ -71,7 +71,7 @@ def test_looking_back_from_the_start_wraps_to_the_end():
     assert keyframes("oooooooxxo", "....mmmmmm") == [1, 7, 9]
 
 
-def test_key_poses_of_random_demonstrations_are_peracts():
+def test_keyframes_of_random_demonstrations_are_peracts():
     rng = random.Random(0)
     for _ in range(500):
         count = rng.randint(1, 40)
@@ -91,7 +91,7 @@ def test_two_arms_stop_together_and_change_alone():
     assert discover_keyframes(gripper, velocity) == [8, 12, 19]
 
 
-def test_samples_start_at_key_poses_and_every_nth_frame():
+def test_samples_start_at_keyframes_and_every_nth_frame():
     assert sample_starts([7, 12, 25], 0) == [(0, 7), (7, 12), (12, 25)]
     assert sample_starts([7, 12, 25], 10) == [(0, 7), (7, 12), (10, 12), (12, 25), (20, 25)]
     assert sample_starts([], 10) == []

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch, perturb_keypoints
+from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 
 KEYPOINTS = np.array([[[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0]]], np.float32)
 
@@ -42,14 +42,3 @@ def test_the_last_keypoint_stays_active():
     np.testing.assert_array_equal(active_keypoint(2, KEYPOINTS[0], count=2), KEYPOINTS[0][1])
     chosen = jax.jit(jax.vmap(active_keypoint))(jnp.array([0, 3]), np.concatenate([KEYPOINTS, KEYPOINTS]))
     np.testing.assert_array_equal(chosen, KEYPOINTS[0][[0, 2]])
-
-
-def test_noise_stays_within_its_bound_and_its_share():
-    moved = jax.vmap(lambda key: perturb_keypoints(key, jnp.zeros((2, 3)), 0.03, 0.5))(
-        jax.random.split(jax.random.key(0), 400)
-    )
-    assert np.abs(moved).max() <= 0.03
-    assert np.abs(moved).max() > 0.025
-    share = (np.abs(moved).sum((1, 2)) > 0).mean()
-    assert 0.4 < share < 0.6
-    np.testing.assert_array_equal(perturb_keypoints(jax.random.key(1), jnp.ones((2, 3)), 0.03, 0.0), 1.0)

@@ -23,7 +23,7 @@ from dsvla_jax.perception.keypoints import (
 )
 from dsvla_jax.perception.phrases import ObjectPhrases, load_table, phrases_for
 from dsvla_jax.perception.simulator import suite_phrases
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.objects import object_geoms, object_masks
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import TASKS

@@ -10,7 +10,7 @@ import pytest
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.rollout import Stopped, run_episodes, run_task
 from dsvla_jax.perception.simulator import SegmentationKeypoints
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action

@@ -9,7 +9,7 @@ import pytest
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.shifts import OFFSET, SHIFTS
 from dsvla_jax.types import TABLE_HEIGHT

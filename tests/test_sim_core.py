@@ -1,7 +1,8 @@
-"""The robot, its kinematics, the controller, both steppers and the episode, against MuJoCo and against physics."""
+"""The robot, its kinematics, the controller, both engines and the environment, against MuJoCo and against physics."""
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Literal
 
 import jax
@@ -17,9 +18,11 @@ from dsvla_jax.geometry.rotations import (
     quaternion_multiply,
     rotation_distance,
 )
-from dsvla_jax.sim import controller, physics, robot
-from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.kinematics import forward_kinematics, inverse_kinematics
+from dsvla_jax.sim import controller, environment, physics, robot
+from dsvla_jax.sim.environment import Environment
+from dsvla_jax.sim.kinematics import forward_kinematics, reaches, track
+from dsvla_jax.sim.mjx_physics import mjx_physics
+from dsvla_jax.sim.mujoco_physics import MujocoPhysics
 from dsvla_jax.sim.scene import build_scene
 from dsvla_jax.sim.tasks import Graspable, Placement, StateView, Task
 from dsvla_jax.sim.tasks.task import BOX, HINGE, SLIDE, SPHERE, add_furniture, add_object, add_part, upright_pose
@@ -27,6 +30,7 @@ from dsvla_jax.types import TABLE_HEIGHT, Action
 
 HALF = 0.0225
 BASE = jnp.array([*robot.SINGLE_BASE, 0, 0, 0, 1], jnp.float32)
+Run = Callable[[physics.SimState, jax.Array, jax.Array], physics.SimState]
 BATCH = 4  # the same everywhere, as each batch size is compiled anew
 
 _forward = jax.jit(jax.vmap(forward_kinematics, in_axes=(0, None)))
@@ -121,7 +125,13 @@ def test_inverse_kinematics_reaches_the_workspace():
     yaw = quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(rng.uniform(-1.5, 1.5, 64), jnp.float32))
     poses = jnp.concatenate([positions, quaternion_multiply(yaw, jnp.asarray(DOWN))], axis=-1)
     seed = jnp.asarray(robot.START_JOINTS, jnp.float32)
-    solve = jax.jit(jax.vmap(lambda pose: inverse_kinematics(pose, seed, BASE)))
+
+    @jax.jit
+    @jax.vmap
+    def solve(pose):
+        joints = track(jnp.broadcast_to(pose, (20, 7)), seed, BASE)[-1]
+        return joints, reaches(joints, pose, BASE)
+
     joints, ok = solve(poses)
     assert np.mean(ok) > 0.95
     reached = _forward(joints, BASE)
@@ -148,7 +158,7 @@ def test_the_path_is_straight_and_ends_at_rest():
 
 
 @pytest.mark.parametrize("num_arms", [1, 2])
-def test_key_poses_are_tracked(num_arms):
+def test_keyframes_are_tracked(num_arms):
     env = _environment(num_arms)
     state = env.reset(_keys())
     sides = np.array([0.0] if num_arms == 1 else [0.3, -0.3])
@@ -159,7 +169,7 @@ def test_key_poses_are_tracked(num_arms):
         )
         positions[..., 1] += sides
         action = _at(positions, gripper)
-        state = env.execute(state, action)
+        state = env.step(state, action)
         pose, gripper_open = env.end_effector(state)
         assert not np.any(state.ik_failed)
         assert np.linalg.norm((pose - action.pose)[..., :3], axis=-1).max() < 0.005
@@ -218,14 +228,26 @@ def test_reset_is_seeded_settled_and_observable():
     assert (np.asarray(env.render(state)[2]) == cube_geom).any()
 
 
+def test_the_compiled_environment_is_the_pure_functions():
+    env = _environment()
+    action = _at(np.full((BATCH, 1, 3), [0.2, 0.1, 1.0]), 0.0)
+    compiled = env.step(env.reset(_keys()), action)
+    started = environment.reset(env.scene, env.renderer, env.physics, _keys(), env.variations(_keys()))
+    pure = environment.step(env.scene, env.physics, started, action)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), pure, compiled)
+    seen, expected = environment.observe(env.scene, env.renderer, pure), env.observe(compiled)
+    np.testing.assert_allclose(seen.pose, expected.pose, atol=1e-5)
+    assert np.mean(np.asarray(seen.rgb) != np.asarray(expected.rgb)) < 1e-2
+
+
 def _carry(env: Environment, state):
     """Grasps, lifts and carries the cube. Returns the state when held, and when carried."""
     cube = _cube(env, state)[:, None, :3]
-    held = env.execute(env.execute(state, _at(cube + _up(0.1), 1.0)), _at(cube, 0.0))
-    lifted = env.execute(held, _at(cube + _up(0.2), 0.0))
+    held = env.step(env.step(state, _at(cube + _up(0.1), 1.0)), _at(cube, 0.0))
+    lifted = env.step(held, _at(cube + _up(0.2), 0.0))
     goal = np.broadcast_to([0.15, 0.0, TABLE_HEIGHT + 0.2], (BATCH, 1, 3))
     turn = quaternion_multiply(quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(0.7)), jnp.array(DOWN))
-    return held, env.execute(lifted, _at(goal, 0.0, turn)), goal
+    return held, env.step(lifted, _at(goal, 0.0, turn)), goal
 
 
 def test_a_cube_is_attached_carried_and_released():
@@ -238,9 +260,9 @@ def test_a_cube_is_attached_carried_and_released():
     np.testing.assert_allclose(_cube(env, carried)[:, :3], goal[:, 0], atol=0.006)
     np.testing.assert_array_equal(env.success(carried), True)
 
-    dropped = env.execute(carried, _at(goal, 1.0))
+    dropped = env.step(carried, _at(goal, 1.0))
     assert not np.asarray(dropped.eq_active)[:, weld].any()
-    settled = env.execute(dropped, _at(goal, 1.0))
+    settled = env.step(dropped, _at(goal, 1.0))
     assert _cube(env, settled)[:, 2].max() < TABLE_HEIGHT + 0.05
     np.testing.assert_array_equal(env.success(settled), True)  # latched
 
@@ -250,10 +272,10 @@ def test_only_a_cube_at_the_closing_fingers_is_attached():
     state = env.reset(_keys())
     weld = env.scene.graspables[0].welds[0]
     cube = _cube(env, state)[:, None, :3]
-    above = env.execute(state, _at(cube + _up(HALF + 0.05), 0.0))
+    above = env.step(state, _at(cube + _up(HALF + 0.05), 0.0))
     assert not np.asarray(above.eq_active)[:, weld].any()
     # The fingers are closed already: touching the cube does not attach it.
-    touched = env.execute(above, _at(cube + _up(HALF + 0.01), 0.0))
+    touched = env.step(above, _at(cube + _up(HALF + 0.01), 0.0))
     assert not np.asarray(touched.eq_active)[:, weld].any()
 
 
@@ -263,19 +285,17 @@ def test_an_unreachable_pose_stops_its_own_episode_only():
     near = _at(np.full((BATCH, 1, 3), [0.2, 0.1, 1.0]), 0.0)
     for bad in (5.0, np.nan):
         mixed = Action(pose=near.pose.at[1, 0, 0].set(bad), gripper_open=near.gripper_open)
-        after = env.execute(state, mixed)
+        after = env.step(state, mixed)
         np.testing.assert_array_equal(after.ik_failed, [False, True, False, False])
         np.testing.assert_allclose(np.asarray(after.qpos)[1], np.asarray(state.qpos)[1], atol=1e-3)
-        alone = env.execute(state, near)
+        alone = env.step(state, near)
         np.testing.assert_array_equal(np.asarray(after.qpos)[[0, 2, 3]], np.asarray(alone.qpos)[[0, 2, 3]])
 
 
 def test_actions_of_a_wrong_shape_are_named():
     env = _environment()
     with pytest.raises(ValueError, match=r"expected pose \(4, 1, 7\)"):
-        env.execute(env.reset(_keys()), _at(np.zeros((BATCH, 2, 3)), 1.0))
-    with pytest.raises(ValueError, match="1 arm"):
-        Environment(env.task, num_arms=2)
+        env.step(env.reset(_keys()), _at(np.zeros((BATCH, 2, 3)), 1.0))
 
 
 @functools.cache
@@ -311,7 +331,7 @@ def _tiny_model() -> mujoco.MjModel:
     return spec.compile()
 
 
-def _tiny_run(stepper: physics.Stepper) -> physics.SimState:
+def _tiny_run(run: Run) -> physics.SimState:
     """Four episodes: the second begins with a non-finite velocity, and each welds its ball at an offset of its own
     half-way through."""
     state = physics.initial_state(_tiny_model(), 4)
@@ -327,7 +347,7 @@ def _tiny_run(stepper: physics.Stepper) -> physics.SimState:
     steps = 120
     controls = np.broadcast_to(np.linspace(0, 1, steps, dtype=np.float32)[None, :, None], (4, steps, 1))
     active = np.broadcast_to((np.arange(steps) >= 60)[None, :, None], (4, steps, 1))
-    return stepper(state, jnp.asarray(controls), _passing_low, jnp.asarray(active))
+    return run(state, jnp.asarray(controls), jnp.asarray(active))
 
 
 def _passing_low(state: physics.SimState) -> physics.Verdict:
@@ -336,10 +356,9 @@ def _passing_low(state: physics.SimState) -> physics.Verdict:
     return state.verdict.replace(succeeded=state.verdict.succeeded | low)
 
 
-def test_both_steppers_agree_and_keep_episodes_apart():
-    c_state = _tiny_run(physics.mujoco_stepper(_tiny_model()))
-    mjx_stepper = physics.mjx_stepper(_tiny_model())
-    mjx_state = _tiny_run(physics.jit_with_mjx(mjx_stepper, static_argnums=2))
+def test_both_engines_agree_and_keep_episodes_apart():
+    c_state = _tiny_run(MujocoPhysics(_tiny_model(), _passing_low))
+    mjx_state = _tiny_run(physics.jit_with_mjx(mjx_physics(_tiny_model(), _passing_low)))
     good = np.array([0, 2, 3])
     for state in (c_state, mjx_state):
         np.testing.assert_array_equal(state.diverged, [False, True, False, False])

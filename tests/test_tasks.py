@@ -9,7 +9,7 @@ from benchmarks.expert_success import run_expert
 from benchmarks.robustness import torment
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import project
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import TASKS, colours, get_task
 from dsvla_jax.types import TABLE_HEIGHT, Action
@@ -65,7 +65,7 @@ def test_the_wrong_object_in_the_bin_is_no_success():
         offset = shift if m < plan.pose.shape[1] - 1 else np.zeros_like(shift)
         pose = np.asarray(plan.pose[:, m]).copy()
         pose[..., :3] += offset[:, None]
-        state = environment.execute(state, Action(jnp.asarray(pose), plan.gripper_open[:, m]))
+        state = environment.step(state, Action(jnp.asarray(pose), plan.gripper_open[:, m]))
     assert not np.asarray(environment.success(state)).any()
 
 
@@ -75,7 +75,7 @@ def test_a_tower_of_too_few_blocks_or_of_others_is_no_success():
     fewer = environment.expert(start.replace(variation=jnp.zeros(2, jnp.int32)))  # two
     others = start.replace(qpos=swapped_blocks(environment, np.array(start.qpos)))
     for state, plan in ((start, fewer), (others, environment.expert(start))):
-        plan = jax.tree.map(lambda x: x[:, :17], plan)  # the key poses of three blocks
+        plan = jax.tree.map(lambda x: x[:, :17], plan)  # the keyframes of three blocks
         assert not np.asarray(environment.success(environment.follow(state, plan)[-1])).any()
 
 

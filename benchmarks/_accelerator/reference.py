@@ -20,7 +20,7 @@ from benchmarks._accelerator.tiny import demonstrations
 from benchmarks.mjx_agreement import outcomes
 from data_pipelines.sources import open_demonstrations
 from dsvla_jax.command_line import configure_jax
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 
 # Metres an axis by which key poses are missed at most, so that not all episodes succeed.

@@ -22,7 +22,7 @@ from dsvla_jax.evaluation.device_rollout import DeviceRollout
 from dsvla_jax.experiment import Experiment, load_experiment
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import Policy, PolicyConfig
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.suite_vocabulary import suite_tokenizer

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_pipelines.inspect.page import Table
-from data_pipelines.oxe.motion import Motion, displacement
-from dsvla_jax.encoding.displacement import LEAST_RANGE
+from data_pipelines.oxe.motion import Motion
+from dsvla_jax.encoding.displacement import LEAST_RANGE, displacement
 
 COMPONENTS = ("x (m)", "y (m)", "z (m)", "rx (rad)", "ry (rad)", "rz (rad)")
 STATISTICS = ("quantity", "mean", "deviation", "least", "1 %", "median", "99 %", "most")

@@ -279,11 +279,3 @@ def _pose_matrix(matrix: np.ndarray, episode: RldsEpisode) -> np.ndarray:
     if len(wrong):
         raise DataError(episode.where, "pose", "rotations", f"another matrix at step {wrong[0]}", fix)
     return candidate
-
-
-def displacement(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """What leads from poses (..., 7) to poses (..., 7), in the base frame: (..., 6), metres and rotation vector."""
-    shape = start.shape[:-1]
-    first, last = (Rotation.from_quat(x[..., 3:].reshape(-1, 4)) for x in (start, end))
-    turned = (last * first.inv()).as_rotvec().reshape(*shape, 3)
-    return np.concatenate([end[..., :3] - start[..., :3], turned], axis=-1)

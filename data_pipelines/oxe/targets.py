@@ -7,9 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_pipelines.oxe.dataset import OxeDataset
-from data_pipelines.oxe.motion import Motion, displacement
+from data_pipelines.oxe.motion import Motion
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.encoding.displacement import LEAST_RANGE
+from dsvla_jax.encoding.displacement import LEAST_RANGE, displacement
 from dsvla_jax.errors import UserError
 
 # A pose that says nothing: the middle of the codec's box, no rotation. Stands for poses that a dataset does not tell.

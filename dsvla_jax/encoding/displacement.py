@@ -10,6 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.geometry.rotations import (
+    hamilton_product,
+    quaternion_to_rotation_vector,
+    rotation_vector_to_quaternion,
+)
 
 HALF_RANGE_ANGLE = np.pi / 2
 """Radians that stand for the end of the range of one axis; three ends together stay below a half turn."""
@@ -33,7 +38,7 @@ class DisplacementScale:
     low: tuple[float, ...]
     high: tuple[float, ...]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.low) != 6 or len(self.high) != 6 or any(a > b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(f"DisplacementScale: expected six low <= high, got {self.low} and {self.high}")
 
@@ -62,28 +67,19 @@ class DisplacementScale:
         return np.where(self.varies, low + (fraction + 1) / 2 * (high - low), low).astype(np.float32)
 
 
+def displacement(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """float64 (..., 6): what leads from poses (..., 7) to poses (..., 7)."""
+    first, last = start[..., 3:].astype(np.float64), end[..., 3:].astype(np.float64)
+    inverse = first * np.array([-1.0, -1.0, -1.0, 1.0])
+    turned = quaternion_to_rotation_vector(hamilton_product(last, inverse))
+    return np.concatenate([end[..., :3] - start[..., :3], turned], axis=-1)
+
+
 def displace(pose: ArrayLike, displacement: ArrayLike) -> np.ndarray:
     """float32 (..., 7): the pose that a displacement (..., 6) leads to from poses (..., 7)."""
     pose, displacement = np.asarray(pose, np.float64), np.asarray(displacement, np.float64)
-    turn, start = rotation_vector_to_quaternion(displacement[..., 3:]), pose[..., 3:]
-    vector = turn[..., 3:] * start[..., :3] + start[..., 3:] * turn[..., :3] + np.cross(turn[..., :3], start[..., :3])
-    real = turn[..., 3:] * start[..., 3:] - np.sum(turn[..., :3] * start[..., :3], axis=-1, keepdims=True)
-    return np.concatenate([pose[..., :3] + displacement[..., :3], vector, real], axis=-1).astype(np.float32)
-
-
-def rotation_vector_to_quaternion(vector: np.ndarray) -> np.ndarray:
-    """(..., 3) radians -> unit quaternions xyzw (..., 4)."""
-    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
-    # sin(a / 2) / a, which is 1 / 2 at 0.
-    return np.concatenate([vector * np.sinc(angle / (2 * np.pi)) / 2, np.cos(angle / 2)], axis=-1)
-
-
-def quaternion_to_rotation_vector(quaternion: np.ndarray) -> np.ndarray:
-    """Unit quaternions xyzw (..., 4) -> (..., 3) radians, at most a half turn."""
-    quaternion = np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
-    sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, quaternion[..., 3:])
-    return quaternion[..., :3] * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0)
+    turned = hamilton_product(rotation_vector_to_quaternion(displacement[..., 3:]), pose[..., 3:])
+    return np.concatenate([pose[..., :3] + displacement[..., :3], turned], axis=-1).astype(np.float32)
 
 
 def _box(codec: PoseCodec) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The keypoint constraint in time: which object point an arm is told to go near, and its noise in training.
+"""The keypoint constraint in time: which object point an arm is told to go near.
 
 An arm has K keypoints in the order the instruction names them. The active one is the first it has not yet come within
 5 cm of; it never goes back, and the last one stays active for good. Arms with fewer than K keypoints repeat their last.
@@ -64,11 +64,3 @@ def replay_latch(end_effector: ArrayLike, keypoints: ArrayLike) -> Array:
         return latched, jax.vmap(active_keypoint)(latched, keypoints)
 
     return jax.lax.scan(look, jnp.zeros(keypoints.shape[0], jnp.int32), jnp.asarray(end_effector))[1]
-
-
-def perturb_keypoints(key: Array, keypoints: ArrayLike, max_offset: float = 0.03, probability: float = 0.5) -> Array:
-    """Training noise: with ``probability`` a sample's keypoints (..., 3) move by up to ``max_offset`` m an axis."""
-    keypoints = jnp.asarray(keypoints)
-    choice_key, offset_key = jax.random.split(key)
-    offsets = jax.random.uniform(offset_key, keypoints.shape, keypoints.dtype, -max_offset, max_offset)
-    return jnp.where(jax.random.bernoulli(choice_key, probability), keypoints + offsets, keypoints)

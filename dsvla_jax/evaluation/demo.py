@@ -25,7 +25,7 @@ from dsvla_jax.geometry.cameras import project
 from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.policy import Decision, Policy
 from dsvla_jax.ranges import at_least, check_fields
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.types import Action, Observation

@@ -4,7 +4,6 @@
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +19,9 @@ from dsvla_jax.model.decode import GREEDY, Decoding, decode_actions
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.policy import Policy, PolicyConfig
-from dsvla_jax.sim.episode import Environment
-from dsvla_jax.sim.physics import SimState, jit_with_mjx
+from dsvla_jax.sim import environment as simulator
+from dsvla_jax.sim.environment import Environment
+from dsvla_jax.sim.physics import Physics, SimState, jit_with_mjx
 from dsvla_jax.types import Array, Text
 
 
@@ -38,7 +38,7 @@ class Rollout:
     keyframes: Array
 
 
-Loop = Callable[[Any, Variables, SimState, Array, Array, Array], Rollout]
+Loop = Callable[[Physics, Variables, SimState, Array, Array, Array], Rollout]
 
 
 def device_loop(
@@ -49,7 +49,7 @@ def device_loop(
     longest_instruction: int,
     decoding: Decoding = GREEDY,
 ) -> Loop:
-    """The pure ``(mjx_model, variables, state, keypoints, beginnings, lengths) -> Rollout`` of an MJX environment.
+    """The pure ``(physics, variables, state, keypoints, beginnings, lengths) -> Rollout`` of an MJX environment.
 
     keypoints: float32 (B, A, K, 3), of the whole episode. beginnings: (B, P), lengths: (B,), the instructions' tokens,
     see `prompt_table.instruction_tokens`. limit: L. longest_instruction: P. ``decoding`` must not sample.
@@ -57,7 +57,7 @@ def device_loop(
     """
     if config.displacement is not None:
         raise ValueError("device_loop: this policy answers with displacements; run it with rollout.run_episodes")
-    if not hasattr(environment, "execute_in_mjx"):
+    if not environment.physics.traceable:
         raise ValueError(f"device_loop: expected Environment({environment.task.name!r}, physics='mjx'), not C MuJoCo's")
     encoding, arms = config.encoding, environment.num_arms
     table = make_prompt_table(tokenizer, encoding, arms)
@@ -65,7 +65,7 @@ def device_loop(
     size = longest_instruction + table.longest
 
     def turn(
-        mjx_model: Any, variables: Variables, state: SimState, active: Array, text: tuple[Array, Array]
+        physics: Physics, variables: Variables, state: SimState, active: Array, text: tuple[Array, Array]
     ) -> tuple[SimState, Array]:
         observation = environment.observe(state)
         robot = observation.robot
@@ -77,10 +77,10 @@ def device_loop(
         prompts = Text(*write_prompts(table, text[0], text[1], integers, size, tokenizer.pad_id))
         inputs = model_inputs(observation.picture, prompts, encoding)
         answer = decode_actions(VLA(config.model), variables, inputs, grammar, decoding, None).integers
-        return environment.execute_in_mjx(mjx_model, state, encoding.codec.decode(answer)), answer
+        return simulator.step(environment.scene, physics, state, encoding.codec.decode(answer)), answer
 
     def run(
-        mjx_model: Any, variables: Variables, state: SimState, keypoints: Array, beginnings: Array, lengths: Array
+        physics: Physics, variables: Variables, state: SimState, keypoints: Array, beginnings: Array, lengths: Array
     ) -> Rollout:
         batch = keypoints.shape[0]
 
@@ -94,7 +94,7 @@ def device_loop(
             latched = jax.vmap(advance_latch)(latched, positions, keypoints)
             active = jax.vmap(jax.vmap(active_keypoint))(latched, keypoints)
             running = ~_over(state)
-            state, answer = turn(mjx_model, variables, state, active, (beginnings, lengths))
+            state, answer = turn(physics, variables, state, active, (beginnings, lengths))
             integers = rollout[0].at[done].set(jnp.where(running[:, None, None], answer, 0))
             return done + 1, state, latched, (integers, rollout[1] + running)
 
@@ -138,4 +138,4 @@ class DeviceRollout:
         beginnings, lengths = instruction_tokens(self._policy.tokenizer, encoding, arms, instructions)
         beginnings = np.pad(beginnings, ((0, 0), (0, self._longest - beginnings.shape[1])))
         keypoints = jnp.asarray(self._environment.keypoints(state) if keypoints is None else keypoints)
-        return self._run(self._environment.mjx_model, self._policy.variables, state, keypoints, beginnings, lengths)
+        return self._run(self._environment.physics, self._policy.variables, state, keypoints, beginnings, lengths)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from dsvla_jax.compile_times import first_use
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action, Camera, Observation
@@ -148,7 +148,7 @@ def run_episodes(
             seen[i].append(rgb[i])
             answers[i].append(texts[i])
             targets[i].append(positions[i])
-        state = environment.execute(state, action)
+        state = environment.step(state, action)
         over |= has_ended(state)
         on_keyframe(done, int(np.sum(environment.success(state))))
     last, reasons = np.asarray(environment.observe(state).picture.rgb), failure_reasons(environment, state)

@@ -1,8 +1,12 @@
-"""Unit quaternions, [x, y, z, w] with the real part last, as in RLBench.
+"""Unit quaternions, [x, y, z, w] with the real part last, as in RLBench, and rotation vectors (axis times angle).
 
 Every function takes float arrays with any leading shape, broadcasts, and is differentiable away from its singularities.
+Those generic in `AnyArray` compute NumPy's arrays with NumPy, in their own precision: jax.numpy would round float64.
 Formulas: https://en.wikipedia.org/wiki/Quaternions_and_spatial_rotation.
 """
+
+from types import ModuleType
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +14,8 @@ from jax.typing import ArrayLike
 
 from dsvla_jax.types import Array
 
-IDENTITY = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+AnyArray = TypeVar("AnyArray", np.ndarray, Array)
+
 # A half turn about x less a half turn about z: the gripper's approach axis (its own +z) points along world -z.
 DOWN = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
 
@@ -22,10 +27,16 @@ def normalize(vector: ArrayLike, epsilon: float = 1e-12) -> Array:
 
 
 def quaternion_multiply(left: ArrayLike, right: ArrayLike) -> Array:
-    """The rotation ``right`` followed by ``left`` (Hamilton product). (..., 4) and (..., 4) -> (..., 4)."""
-    x1, y1, z1, w1 = jnp.moveaxis(jnp.asarray(left), -1, 0)
-    x2, y2, z2, w2 = jnp.moveaxis(jnp.asarray(right), -1, 0)
-    return jnp.stack(
+    """The rotation ``right`` followed by ``left``. (..., 4) and (..., 4) -> (..., 4)."""
+    return hamilton_product(jnp.asarray(left), jnp.asarray(right))
+
+
+def hamilton_product(left: AnyArray, right: AnyArray) -> AnyArray:
+    """`quaternion_multiply` of two arrays of one library."""
+    library = _library(left)
+    x1, y1, z1, w1 = library.moveaxis(left, -1, 0)
+    x2, y2, z2, w2 = library.moveaxis(right, -1, 0)
+    return library.stack(
         [
             w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
             w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
@@ -60,15 +71,35 @@ def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
     )
 
 
-def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
+def rotation_vector_to_quaternion(vector: AnyArray) -> AnyArray:
+    """Rotation vectors (..., 3) -> unit quaternions (..., 4)."""
+    library = _library(vector)
+    angle = library.linalg.norm(vector, axis=-1, keepdims=True)
+    # sin(a / 2) / a, which is 1 / 2 at 0.
+    imaginary = vector * library.sinc(angle / (2 * np.pi)) / 2
+    return library.concatenate([imaginary, library.cos(angle / 2)], axis=-1)
+
+
+def quaternion_to_rotation_vector(quaternion: AnyArray) -> AnyArray:
+    """Unit quaternions (..., 4) -> rotation vectors (..., 3) of at most half a turn."""
+    library = _library(quaternion)
+    real = quaternion[..., 3:]
+    imaginary = quaternion[..., :3] * library.where(real < 0, -1.0, 1.0)
+    sine = library.linalg.norm(imaginary, axis=-1, keepdims=True)
+    angle = 2.0 * library.arctan2(sine, abs(real))
+    return imaginary * library.where(sine < 1e-6, 2.0, angle / library.maximum(sine, 1e-6))
+
+
+def quaternion_to_matrix(quaternion: AnyArray) -> AnyArray:
     """Unit quaternions (..., 4) -> rotation matrices (..., 3, 3)."""
-    x, y, z, w = jnp.moveaxis(jnp.asarray(quaternion), -1, 0)
+    library = _library(quaternion)
+    x, y, z, w = library.moveaxis(quaternion, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return library.stack([library.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def matrix_to_quaternion(matrix: ArrayLike) -> Array:
@@ -170,3 +201,7 @@ def rotation_distance(first: ArrayLike, second: ArrayLike) -> Array:
     """The angle in radians, 0 to pi, of the turn that takes one rotation to the other. (..., 4) x 2 -> (...,)."""
     difference = quaternion_multiply(quaternion_conjugate(first), second)
     return 2.0 * jnp.arctan2(jnp.linalg.norm(difference[..., :3], axis=-1), jnp.abs(difference[..., 3]))
+
+
+def _library(array: np.ndarray | Array) -> ModuleType:
+    return np if isinstance(array, np.ndarray) else jnp

@@ -12,7 +12,7 @@ import numpy as np
 
 from dsvla_jax.perception.keypoints import KeypointsNotFound, KeypointTracker, Sighting
 from dsvla_jax.perception.phrases import ObjectPhrases
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.objects import object_masks
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.tasks import TASKS

@@ -1,4 +1,4 @@
-"""Executing a key pose: a straight-line path, joint targets for every physics step, and attaching on grasp.
+"""Executing a keyframe: a straight-line path, joint targets for every physics step, and attaching on grasp.
 
 As RLBench's ``MoveArmThenGripper``: the arm goes to the pose on a straight line, then the gripper opens or closes; a
 graspable between closing fingers is attached to the hand, and released before the fingers open. All functions are per
@@ -35,14 +35,15 @@ GRASP_MARGIN = 0.01  # metres around a graspable's box within which the tool cen
 OPEN_THRESHOLD = 0.9  # RLBench: a gripper is open if its fingers are beyond 90% of their travel
 
 
-def _stack(arms: Sequence[Arm], field: str) -> np.ndarray:
-    return np.stack([np.asarray(getattr(arm, field)) for arm in arms])
+def _bases(arms: Sequence[Arm]) -> Array:
+    """float32 (A, 7)."""
+    return jnp.asarray(np.stack([arm.base for arm in arms]))
 
 
 def end_effector(qpos: Array, arms: Sequence[Arm]) -> tuple[Array, Array]:
     """qpos (nq,) -> pose float32 (A, 7) of each tool centre point, gripper_open float32 (A,), 0 or 1."""
-    poses = jax.vmap(forward_kinematics)(qpos[_stack(arms, "joints")], jnp.asarray(_stack(arms, "base")))
-    travel = jnp.mean(qpos[_stack(arms, "fingers")], axis=-1) / robot.FINGER_TRAVEL
+    poses = jax.vmap(forward_kinematics)(qpos[np.stack([arm.joints for arm in arms])], _bases(arms))
+    travel = jnp.mean(qpos[np.stack([arm.fingers for arm in arms])], axis=-1) / robot.FINGER_TRAVEL
     return poses, (travel > OPEN_THRESHOLD).astype(jnp.float32)
 
 
@@ -57,7 +58,7 @@ def straight_line(start: Array, end: Array) -> Array:
 def plan_joints(joints: Array, pose: Array, base: Array) -> tuple[Array, Array]:
     """Joint angles (7,) now, target pose (7,), base (7,) -> knots (WAYPOINTS + 1, 7) in joint space, ok bool ().
 
-    Only the key pose itself must be reached; a waypoint on the way that is not bends the path.
+    Only the keyframe itself must be reached; an earlier waypoint that is missed only bends the path.
     """
     end = jnp.concatenate([pose[:3], normalize(pose[3:])])
     line = straight_line(forward_kinematics(joints, base), end)
@@ -91,8 +92,11 @@ def joint_targets(knots: Array) -> Array:
 
 
 class Plan(NamedTuple):
-    """controls: float32 (KEYFRAME_STEPS, nu). ok: bool (), False if a pose is out of reach, and then the controls hold
-    still. opening, closing: bool (A,), the grippers that are told to open, and those that go from open to closed."""
+    """One keyframe of all arms.
+
+    controls: float32 (KEYFRAME_STEPS, nu). ok: bool (), False if a pose is out of reach, and then the controls hold
+    still. opening, closing: bool (A,), the grippers that are commanded to open, and those that go from open to closed.
+    """
 
     controls: Array
     ok: Array
@@ -107,13 +111,13 @@ def plan(ctrl: Array, action: Action, arms: Sequence[Arm]) -> Plan:
         ctrl: float32 (nu,), the controls in force; the path starts from the posture that they command.
         action: pose (A, 7), gripper_open (A,). arms: A arms.
     """
-    commanded = ctrl[_stack(arms, "actuators")]  # (A, 7)
-    knots, reached = jax.vmap(plan_joints)(commanded, action.pose, jnp.asarray(_stack(arms, "base")))
+    commanded = ctrl[np.stack([arm.actuators for arm in arms])]  # (A, 7)
+    knots, reached = jax.vmap(plan_joints)(commanded, action.pose, _bases(arms))
     ok = jnp.all(reached) & jnp.all(jnp.isfinite(action.gripper_open))
     targets = jax.vmap(joint_targets)(knots)  # (A, MOVE_STEPS, 7)
 
     opens = action.gripper_open > 0.5
-    was_open = ctrl[_stack(arms, "gripper")] > robot.FINGER_TRAVEL / 2
+    was_open = ctrl[np.array([arm.gripper for arm in arms])] > robot.FINGER_TRAVEL / 2
     gripper = jnp.where(opens, robot.GRIPPER_OPEN_CONTROL, robot.GRIPPER_CLOSED_CONTROL)
 
     controls = jnp.broadcast_to(ctrl, (KEYFRAME_STEPS, *ctrl.shape))

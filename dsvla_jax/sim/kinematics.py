@@ -4,7 +4,7 @@ The chain is ``robot.py``'s. Poses are [x, y, z, qx, qy, qz, qw] of the tool cen
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,10 @@ import numpy as np
 
 from dsvla_jax.geometry.rotations import (
     matrix_to_quaternion,
-    normalize,
     quaternion_conjugate,
     quaternion_multiply,
     quaternion_to_matrix,
+    quaternion_to_rotation_vector,
 )
 from dsvla_jax.sim import robot
 from dsvla_jax.types import Array
@@ -30,18 +30,12 @@ _JOINT_HIGH = (robot.JOINT_HIGH - 0.005).astype(np.float32)
 
 
 def _rotation_from_wxyz(quaternion: np.ndarray) -> np.ndarray:
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """(..., 4) of any length -> float64 (..., 3, 3)."""
+    return quaternion_to_matrix(np.roll(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, axis=-1))
 
 
 # Rounded, as quarter turns are exactly that.
-_LINK_ROTATIONS = np.stack([_rotation_from_wxyz(q) for q in robot.LINK_QUATERNIONS_WXYZ]).round(12)
+_LINK_ROTATIONS = _rotation_from_wxyz(robot.LINK_QUATERNIONS_WXYZ).round(12)
 # The hand and the tool centre point are rigid behind the last joint: one transform.
 _TOOL_ROTATION = (_LINK_ROTATIONS[7] @ _rotation_from_wxyz(robot.TCP_QUATERNION_WXYZ)).round(12)
 _TOOL_POSITION = robot.LINK_POSITIONS[7] + _LINK_ROTATIONS[7] @ robot.TCP_POSITION
@@ -57,7 +51,7 @@ class Chain(NamedTuple):
     position: Array
 
 
-def _combine(columns: Sequence[Array], weights: np.ndarray) -> Any:
+def _combine(columns: Sequence[Array], weights: np.ndarray) -> Array | float:
     """The sum of three vectors times constants (3,), or 0 if all of these are.
 
     Written out because most are 0 or 1, and because products of 3x3 matrices one by one cost a CPU more in calls than
@@ -89,18 +83,10 @@ def forward_kinematics(joints: Array, base: Array) -> Array:
     return jnp.concatenate([chain.position, matrix_to_quaternion(chain.rotation)])
 
 
-def _rotation_vector(quaternion: Array) -> Array:
-    """Unit quaternion (4,) -> axis times angle (3,), angle in [0, pi]."""
-    imaginary = quaternion[:3] * jnp.where(quaternion[3] < 0, -1.0, 1.0)
-    length = jnp.linalg.norm(imaginary)
-    angle = 2.0 * jnp.arctan2(length, jnp.abs(quaternion[3]))
-    return imaginary * jnp.where(length < 1e-6, 2.0, angle / jnp.maximum(length, 1e-6))
-
-
 def _pose_error(chain: Chain, target: Array) -> Array:
     """(6,) translation in metres and rotation vector in radians that would bring the tool to the target pose."""
     difference = quaternion_multiply(target[3:], quaternion_conjugate(matrix_to_quaternion(chain.rotation)))
-    return jnp.concatenate([target[:3] - chain.position, _rotation_vector(difference)])
+    return jnp.concatenate([target[:3] - chain.position, quaternion_to_rotation_vector(difference)])
 
 
 def _solve_spd(matrix: Array, right: Array) -> Array:
@@ -152,18 +138,3 @@ def reaches(joints: Array, pose: Array, base: Array) -> Array:
     """bool (): whether the joints (7,) hold the tool centre point within 2 mm and 0.02 rad of ``pose`` (7,)."""
     error = _pose_error(_chain(joints, base), pose)
     return (jnp.linalg.norm(error[:3]) < POSITION_TOLERANCE) & (jnp.linalg.norm(error[3:]) < ROTATION_TOLERANCE)
-
-
-def inverse_kinematics(pose: Array, seed: Array, base: Array, iterations: int = 20) -> tuple[Array, Array]:
-    """Joint angles that bring the tool centre point to ``pose``, found from ``seed`` by ``track``.
-
-    Args:
-        pose: float32 (7,). Its quaternion need not be normalised.
-        seed: float32 (7,). base: float32 (7,) pose of the arm's base in the world.
-        iterations: fixed, so that shapes and time are static.
-    Returns:
-        joints float32 (7,) within the limits, and ok: bool (), True if the pose is reached.
-    """
-    pose = jnp.concatenate([pose[:3], normalize(pose[3:])])
-    joints = track(jnp.broadcast_to(pose, (iterations, 7)), seed, base)[-1]
-    return joints, reaches(joints, pose, base)

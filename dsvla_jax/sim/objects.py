@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.sim.episode import Environment
+from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.tasks.task import fill
 
@@ -36,7 +36,7 @@ def object_geoms(environment: Environment, variation: int) -> list[list[int]]:
 
 def object_masks(environment: Environment, state: SimState) -> np.ndarray:
     """bool (B, K, H, W): the visible pixels of the K objects of the environment's task, in the order of `objects`."""
-    segmentation = np.asarray(environment.render(state)[2])
+    segmentation = np.asarray(environment.render(state).segmentation)
     return np.array(
         [
             [np.isin(shown, geoms) for geoms in object_geoms(environment, variation)]

@@ -12,14 +12,15 @@ in the cache, and neither memory nor compile time grows with the number of geoms
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from flax import struct
 
+from dsvla_jax.sim.light import light_direction
 from dsvla_jax.types import Array, Camera
 
 PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -33,7 +34,6 @@ FIRST_HIDDEN_GROUP = 3  # mujoco's viewers show geom groups 0 to 2 and hide 3 to
 NEAR = 0.01
 FAR = 4.5  # clipping planes of RLBench's cameras, metres
 SKY = (0.62, 0.72, 0.82)
-LIGHT_DIRECTION = (-0.35, 0.25, -1.0)
 AMBIENT, HEADLIGHT, SUN = 0.35, 0.25, 0.5
 MAX_BLOCK_RAYS = 2**15  # more rays at once fall out of a CPU's second-level cache
 _TINY = 1e-9
@@ -48,25 +48,42 @@ class Vector(NamedTuple):
     z: Array
 
 
+Span = tuple[Array, Array]  # ray parameters at which rays enter and leave a geom; enter > leave where they miss
+Interval = Callable[[Vector, Vector, Array], Span]  # origins, directions in the geom's frame, its size
+Carry = TypeVar("Carry")
+
+
+class Geom(NamedTuple):
+    """One geom: position (3,) and rotation (3, 3) in the world, size (3,), geom id (), and whether it is drawn ()."""
+
+    position: Array
+    rotation: Array
+    size: Array
+    index: Array
+    shown: Array
+
+
+class Poses(NamedTuple):
+    """xpos: float32 (Ng, 3), xmat: float32 (Ng, 3, 3), world poses of all geoms. rgba: float32 (Ng, 4)."""
+
+    xpos: Array
+    xmat: Array
+    rgba: Array
+
+
 @struct.dataclass
 class Primitives:
     """The visible geoms of a model, grouped by type.
 
     sizes: float32 (Ng, 3), MuJoCo's ``geom_size`` of all geoms (half extents, radii, half lengths).
     groups: ((geom type, (geom ids...)), ...), static, only of visible geoms.
-    light_direction: float32 (3,), unit, the way the light travels in the world frame.
+    light_direction: float32 (3,), unit, the direction in which light travels, world frame.
     """
 
     sizes: Array
     light_direction: Array
     groups: tuple[tuple[int, tuple[int, ...]], ...] = struct.field(pytree_node=False)
     geom_types: tuple[int, ...] = struct.field(pytree_node=False)
-
-
-def light_direction() -> np.ndarray:
-    """float32 (3,), unit: the way that light usually travels in the world."""
-    direction = np.asarray(LIGHT_DIRECTION)
-    return (direction / np.linalg.norm(direction)).astype(np.float32)
 
 
 def primitives_from_model(model: mujoco.MjModel) -> Primitives:
@@ -111,14 +128,14 @@ def _out_of(rotation: Array, v: Vector) -> Vector:
     )
 
 
-def _slab(origin: Array, direction: Array, half: Array) -> tuple[Array, Array]:
+def _slab(origin: Array, direction: Array, half: Array) -> Span:
     """Interval in which |origin + t direction| <= half."""
     inverse = 1.0 / jnp.where(jnp.abs(direction) < _TINY, _TINY, direction)
     middle, reach = -origin * inverse, half * jnp.abs(inverse)
     return middle - reach, middle + reach
 
 
-def _ball(origins, directions, radius: Array) -> tuple[Array, Array]:
+def _ball(origins: Sequence[Array], directions: Sequence[Array], radius: Array) -> Span:
     """Interval inside a ball or (two components) an infinite cylinder.
 
     The squared distance of the closest approach is formed from the perpendicular itself instead of by b^2 - 4ac: that
@@ -134,21 +151,21 @@ def _ball(origins, directions, radius: Array) -> tuple[Array, Array]:
     return jnp.where(hit, closest - reach, jnp.inf), jnp.where(hit, closest + reach, -jnp.inf)
 
 
-def _sphere(o: Vector, d: Vector, size: Array):
+def _sphere(o: Vector, d: Vector, size: Array) -> Span:
     return _ball(o, d, size[0])
 
 
-def _ellipsoid(o: Vector, d: Vector, size: Array):
+def _ellipsoid(o: Vector, d: Vector, size: Array) -> Span:
     inverse = 1.0 / size
     return _ball([c * inverse[i] for i, c in enumerate(o)], [c * inverse[i] for i, c in enumerate(d)], jnp.float32(1.0))
 
 
-def _cylinder(o: Vector, d: Vector, size: Array):
+def _cylinder(o: Vector, d: Vector, size: Array) -> Span:
     around, between = _ball(o[:2], d[:2], size[0]), _slab(o.z, d.z, size[1])
     return jnp.maximum(around[0], between[0]), jnp.minimum(around[1], between[1])
 
 
-def _capsule(o: Vector, d: Vector, size: Array):
+def _capsule(o: Vector, d: Vector, size: Array) -> Span:
     body = _cylinder(o, d, size)
     missed = body[0] > body[1]
     enter, leave = jnp.where(missed, jnp.inf, body[0]), jnp.where(missed, -jnp.inf, body[1])
@@ -158,14 +175,14 @@ def _capsule(o: Vector, d: Vector, size: Array):
     return enter, leave
 
 
-def _box(o: Vector, d: Vector, size: Array):
+def _box(o: Vector, d: Vector, size: Array) -> Span:
     slabs = [_slab(o[i], d[i], size[i]) for i in range(3)]
     enter = jnp.maximum(jnp.maximum(slabs[0][0], slabs[1][0]), slabs[2][0])
     leave = jnp.minimum(jnp.minimum(slabs[0][1], slabs[1][1]), slabs[2][1])
     return enter, leave
 
 
-def _plane(o: Vector, d: Vector, size: Array):
+def _plane(o: Vector, d: Vector, size: Array) -> Span:
     """A plane is seen from above only and, as in MuJoCo, is infinite along an axis whose half size is 0."""
     t = -o.z / jnp.minimum(d.z, -_TINY)
     hit = d.z < -_TINY
@@ -174,7 +191,7 @@ def _plane(o: Vector, d: Vector, size: Array):
     return jnp.where(hit, t, jnp.inf), jnp.where(hit, t, -jnp.inf)
 
 
-_INTERVALS = {
+_INTERVALS: dict[int, Interval] = {
     PLANE: _plane,
     SPHERE: _sphere,
     CAPSULE: _capsule,
@@ -184,17 +201,23 @@ _INTERVALS = {
 }
 
 
-def _scan_geoms(primitives: Primitives, xpos, xmat, rgba, carry, visit, skip=()):
-    """Fold ``visit(carry, interval function, position, rotation, size, geom id, shown)`` over the visible geoms."""
+def _scan_geoms(
+    primitives: Primitives,
+    poses: Poses,
+    carry: Carry,
+    visit: Callable[[Carry, Interval, Geom], Carry],
+    skip: Sequence[int] = (),
+) -> Carry:
+    """Folds ``visit`` over the visible geoms of all types but those to skip."""
     for kind, members in primitives.groups:
         if kind in skip:
             continue
         ids = jnp.asarray(members, jnp.int32)
 
-        def step(state, geom, interval=_INTERVALS[kind]):
-            return visit(state, interval, *geom), None
+        def step(state: Carry, geom: Geom, interval: Interval = _INTERVALS[kind]) -> tuple[Carry, None]:
+            return visit(state, interval, geom), None
 
-        geoms = (xpos[ids], xmat[ids], primitives.sizes[ids], ids, rgba[ids, 3] > 0.0)
+        geoms = Geom(poses.xpos[ids], poses.xmat[ids], primitives.sizes[ids], ids, poses.rgba[ids, 3] > 0.0)
         carry, _ = jax.lax.scan(step, carry, geoms)
     return carry
 
@@ -230,18 +253,19 @@ def _unit(v: Vector) -> Vector:
     return Vector(v.x * scale, v.y * scale, v.z * scale)
 
 
-def _cast(primitives: Primitives, xpos, xmat, rgba, eye: Array, d: Vector, shadows: bool):
+def _cast(primitives: Primitives, poses: Poses, eye: Array, d: Vector, shadows: bool) -> tuple[Array, Array, Array]:
     """Colour (R, 3) in [0, 1], ray parameter (R,) and geom id (R,) of rays ``eye + t d``."""
+    xpos, xmat, rgba = poses
 
-    def nearest(state, interval, position, rotation, size, index, shown):
+    def nearest(state: tuple[Array, Array], interval: Interval, geom: Geom) -> tuple[Array, Array]:
         best, winner = state
-        origin = _into(rotation, Vector(*(eye - position)))
-        enter, leave = interval(origin, _into(rotation, d), size)
-        closer = (enter <= leave) & (enter > NEAR) & (enter < best) & shown
-        return jnp.where(closer, enter, best), jnp.where(closer, index, winner)
+        origin = _into(geom.rotation, Vector(*(eye - geom.position)))
+        enter, leave = interval(origin, _into(geom.rotation, d), geom.size)
+        closer = (enter <= leave) & (enter > NEAR) & (enter < best) & geom.shown
+        return jnp.where(closer, enter, best), jnp.where(closer, geom.index, winner)
 
     start = (jnp.full_like(d.x, jnp.inf), jnp.full(d.x.shape, -1, jnp.int32))
-    t, winner = _scan_geoms(primitives, xpos, xmat, rgba, start, nearest)
+    t, winner = _scan_geoms(primitives, poses, start, nearest)
 
     hit = winner >= 0
     distance = jnp.where(hit, t, 0.0)
@@ -261,13 +285,13 @@ def _cast(primitives: Primitives, xpos, xmat, rgba, eye: Array, d: Vector, shado
     if shadows:
         point = Vector(*(eye[i] + world_from_eye[i] + _SHADOW_OFFSET * normal[i] for i in range(3)))
 
-        def occluded(dark, interval, position, turn, extent, index, shown):
-            origin = _into(turn, Vector(*(point[i] - position[i] for i in range(3))))
-            enter, leave = interval(origin, _into(turn, to_light), extent)
-            return dark | ((enter <= leave) & (leave > 0.0) & shown)
+        def occluded(dark: Array, interval: Interval, geom: Geom) -> Array:
+            origin = _into(geom.rotation, Vector(*(point[i] - geom.position[i] for i in range(3))))
+            enter, leave = interval(origin, _into(geom.rotation, to_light), geom.size)
+            return dark | ((enter <= leave) & (leave > 0.0) & geom.shown)
 
         # A plane is ground or table here: it lies under everything the light reaches.
-        dark = _scan_geoms(primitives, xpos, xmat, rgba, jnp.zeros_like(hit), occluded, skip=(PLANE,))
+        dark = _scan_geoms(primitives, poses, jnp.zeros_like(hit), occluded, skip=(PLANE,))
         lit = jnp.where(dark, 0.0, lit)
     brightness = AMBIENT + HEADLIGHT * facing + SUN * lit
     colour = jnp.where(hit[:, None], rgba[geom, :3] * brightness[:, None], jnp.asarray(SKY, jnp.float32))
@@ -308,14 +332,17 @@ def render(
     Returns rgb uint8 (H, W, 3); depth float32 (H, W), planar metres, 0 where nothing is hit up to ``far``; and
     segmentation int32 (H, W), the geom id or -1 where nothing is hit. Surfaces beyond ``far`` keep colour and id.
     """
-    xpos, rgba = jnp.asarray(geom_xpos, jnp.float32), jnp.asarray(geom_rgba, jnp.float32)
-    xmat = jnp.asarray(geom_xmat, jnp.float32).reshape(-1, 3, 3)
+    poses = Poses(
+        xpos=jnp.asarray(geom_xpos, jnp.float32),
+        xmat=jnp.asarray(geom_xmat, jnp.float32).reshape(-1, 3, 3),
+        rgba=jnp.asarray(geom_rgba, jnp.float32),
+    )
     rows = max(n for n in range(1, height + 1) if height % n == 0 and (n == 1 or n * width <= max_block_rays))
     eye = jnp.asarray(camera.world_from_camera, jnp.float32)[:3, 3]
     directions = pixel_directions(camera, height, width).reshape(height // rows, rows * width, 3)
 
-    def block(rays):
-        return _cast(primitives, xpos, xmat, rgba, eye, Vector(*rays.T), shadows)
+    def block(rays: Array) -> tuple[Array, Array, Array]:
+        return _cast(primitives, poses, eye, Vector(*rays.T), shadows)
 
     if rows == height:
         colour, t, winner = block(directions[0])

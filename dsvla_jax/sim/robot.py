@@ -113,19 +113,16 @@ class Arm:
     """Where one arm lives in a compiled model.
 
     prefix: of all its names. base: float32 (7,) pose of its base in the world.
-    joints, dofs: int (7,) indices into qpos and qvel. actuators: int (7,) into ctrl.
+    joints: int (7,) indices into qpos. actuators: int (7,) into ctrl.
     fingers: int (2,) into qpos. gripper: the gripper's index in ctrl; its control is one finger's travel in metres.
-    hand: body id.
     """
 
     prefix: str
     base: np.ndarray
     joints: np.ndarray
-    dofs: np.ndarray
     actuators: np.ndarray
     fingers: np.ndarray
     gripper: int
-    hand: int
 
 
 GRIPPER_OPEN_CONTROL = FINGER_TRAVEL
@@ -215,11 +212,9 @@ def find_arm(model: mujoco.MjModel, prefix: str) -> Arm:
         prefix=prefix,
         base=np.array([*base_body.pos, x, y, z, w], np.float32),
         joints=np.array([j.qposadr[0] for j in joints]),
-        dofs=np.array([j.dofadr[0] for j in joints]),
         actuators=np.array([model.actuator(f"{prefix}joint{i + 1}").id for i in range(7)]),
         fingers=np.array([j.qposadr[0] for j in fingers]),
         gripper=int(model.actuator(f"{prefix}gripper").id),
-        hand=int(model.body(f"{prefix}hand").id),
     )
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -47,6 +46,7 @@ class GraspableBody:
 class Scene:
     """A compiled task.
 
+    shifts: the names of the test conditions under which its episodes begin, see `sim/shifts.py`.
     arms: the left arm first; a single arm is called left. graspables: in the task's order.
     attachments: int, the equality constraints of the task's attachments.
     initial: qpos (nq,), ctrl (nu,), mocap_pos (nmocap, 3), mocap_quat (nmocap, 4) wxyz and geom_rgba (ngeom, 4), all
@@ -60,6 +60,7 @@ class Scene:
     graspables: tuple[GraspableBody, ...]
     attachments: np.ndarray
     initial: "SceneState"
+    shifts: tuple[str, ...] = ()
 
     @property
     def welds(self) -> np.ndarray:
@@ -82,15 +83,15 @@ class Scene:
         state, layout = self.initial, self.layout
         qpos, pos, quat, rgba = state.qpos, state.mocap_pos, state.mocap_quat, state.geom_rgba
         for name, pose in placement.mocap.items():
-            index = layout.address("mocap", name)
+            index = layout.mocap_index(name)
             pos = pos.at[index].set(pose[:3])
             quat = quat.at[index].set(rotations.quaternion_to_wxyz(pose[3:]))
         for name, pose in placement.free.items():
-            address = layout.address("free", name)
+            address = layout.free_address(name)
             wxyz = rotations.quaternion_to_wxyz(pose[3:])
             qpos = qpos.at[address : address + 7].set(jnp.concatenate([pose[:3], wxyz]))
         for name, value in placement.joints.items():
-            qpos = qpos.at[layout.address("joints", name)].set(value)
+            qpos = qpos.at[layout.joint_address(name)].set(value)
         for name, colour in placement.rgba.items():
             rgba = rgba.at[self.mj_model.geom(name).id].set(colour)
         return SceneState(qpos=qpos, ctrl=state.ctrl, mocap_pos=pos, mocap_quat=quat, geom_rgba=rgba)
@@ -107,8 +108,11 @@ class SceneState:
     geom_rgba: Array
 
 
-def build_scene(task: Task, clutter: bool = False) -> Scene:
-    """Compiles the model of a task. clutter: with things only to look at, out of sight until they are placed."""
+def build_scene(task: Task, shifts: tuple[str, ...] = ()) -> Scene:
+    """Compiles the model of a task, with clutter, out of sight until it is placed, if "background" is among the shifts.
+
+    Raises ValueError for a task with another number of arms than 1 or 2.
+    """
     spec = mujoco.MjSpec()
     robot.set_physics_options(spec)
     spec.worldbody.add_geom(
@@ -127,7 +131,7 @@ def build_scene(task: Task, clutter: bool = False) -> Scene:
     for prefix, base in zip(prefixes, bases, strict=True):
         robot.add_panda(spec, prefix, base)
     task.build(spec)
-    for i, (shape, size) in enumerate(_CLUTTER_SHAPES if clutter else ()):
+    for i, (shape, size) in enumerate(_CLUTTER_SHAPES if "background" in shifts else ()):
         body = spec.worldbody.add_body(name=f"{CLUTTER}{i}", mocap=True, pos=[0, 0, -1])
         body.add_geom(name=f"{CLUTTER}{i}", type=shape, size=size, contype=0, conaffinity=0)
     for graspable in task.graspables:
@@ -155,6 +159,7 @@ def build_scene(task: Task, clutter: bool = False) -> Scene:
         ),
         attachments=np.array([model.equality(_weld_name(a.carrier, a.body)).id for a in task.attachments], np.int32),
         initial=_initial_state(model, arms),
+        shifts=shifts,
     )
 
 
@@ -193,11 +198,12 @@ def _layout(model: mujoco.MjModel, arms: tuple[robot.Arm, ...], graspables: tupl
     for body in bodies:  # parents come first
         parent = bodies[body.parentid[0]].name
         if parent in {*free, *mocap, *links}:
-            links[body.name] = _link(model, body, parent)
+            links[body.name] = _link(model, body.id, parent)
     return StateLayout(free=free, mocap=mocap, joints=joints, links=links, graspables=graspables, arms=arms)
 
 
-def _link(model: mujoco.MjModel, body: Any, parent: str) -> Link:
+def _link(model: mujoco.MjModel, body_id: int, parent: str) -> Link:
+    body = model.body(body_id)
     w, x, y, z = body.quat.tolist()
     joints = [model.joint(body.jntadr[0] + i) for i in range(body.jntnum[0])]
     if any(joint.type[0] == mujoco.mjtJoint.mjJNT_BALL for joint in joints):

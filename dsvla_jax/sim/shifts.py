@@ -5,11 +5,11 @@
     background  clutter on the table, another table top, light from elsewhere
     camera      another view of the table; its calibration is known, as that of the usual view is
 
-Each is a pure function (key, start of one episode) -> start; vmap them over episodes.
+Each is a pure function (scene, key, start of one episode) -> start; vmap them over episodes.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,6 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.rotations import quaternion_from_axis_angle, quaternion_to_matrix
 from dsvla_jax.sim.scene import CLUTTER, Scene, SceneState
 from dsvla_jax.types import TABLE_HEIGHT, Array, Camera
-
-SHIFTS = ("instance", "position", "background", "camera")
 
 # Half ranges of what is drawn: the paper gives none.
 HUE, BRIGHTNESS = np.pi, 0.2  # radians about the grey axis, relative
@@ -41,8 +39,8 @@ ASIDE, ALONG = (0.34, 0.46), (0.02, 0.4)
 
 @struct.dataclass
 class Start:
-    """How an episode begins, and how it is looked at. camera: of one example. light: float32 (3,), unit, the way that
-    light travels. geom_size, geom_pos: float32 (ngeom, 3), in their bodies' frames."""
+    """How an episode begins, and how it is looked at. camera: of one example. light: float32 (3,), unit, the
+    direction in which light travels. geom_size, geom_pos: float32 (ngeom, 3), in their bodies' frames."""
 
     scene: SceneState
     camera: Camera
@@ -59,18 +57,13 @@ def check_shifts(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in SHIFTS if name in names)
 
 
-def shift(names: Sequence[str], scene: Scene, key: Array, start: Start) -> Start:
-    """Applies the named shifts."""
-    functions = {"instance": other_instance, "position": other_position, "background": other_background}
+def shift(scene: Scene, key: Array, start: Start) -> Start:
+    """Applies the scene's shifts, each with a random stream of its own."""
     # Accelerators would otherwise multiply float32 matrices in fewer bits than a camera's pose bears.
     with jax.default_matmul_precision("highest"):
-        for number, name in enumerate(SHIFTS):
-            if name in names:
-                stream = jax.random.fold_in(key, number)
-                if name == "camera":
-                    start = start.replace(camera=other_view(stream, start.camera))
-                else:
-                    start = functions[name](scene, stream, start)
+        for number, (name, apply) in enumerate(_FUNCTIONS.items()):
+            if name in scene.shifts:
+                start = apply(scene, jax.random.fold_in(key, number), start)
     return start
 
 
@@ -96,7 +89,7 @@ def other_instance(scene: Scene, key: Array, start: Start) -> Start:
         size = size.at[geoms].multiply(factor)
         position = position.at[geoms].multiply(factor)
         # It stays on what it stands on.
-        height = scene.layout.address("free", name) + 2
+        height = scene.layout.free_address(name) + 2
         qpos = qpos.at[height].add((factor[2] - 1) * _reach_down(model, geoms))
     return start.replace(scene=start.scene.replace(geom_rgba=rgba, qpos=qpos), geom_size=size, geom_pos=position)
 
@@ -116,7 +109,7 @@ def other_position(scene: Scene, key: Array, start: Start) -> Start:
         if name in layout.mocap:
             places = places.at[layout.mocap[name], :2].add(offset)
         else:
-            address = layout.address("free", name)
+            address = layout.free_address(name)
             qpos = qpos.at[address : address + 2].add(offset)
     return start.replace(scene=start.scene.replace(qpos=qpos, mocap_pos=places))
 
@@ -144,17 +137,26 @@ def other_background(scene: Scene, key: Array, start: Start) -> Start:
     )
 
 
-def other_view(key: Array, camera: Camera) -> Camera:
-    """The camera moved on a sphere about the middle of the table, and nearer or farther."""
+def other_view(scene: Scene, key: Array, start: Start) -> Start:
+    """Moves the front camera on a sphere about the middle of the table, and nearer or farther."""
     around, over, far = jax.random.uniform(key, (3,), minval=-1.0)
-    pose = camera.world_from_camera
+    pose = start.camera.world_from_camera
     up = jnp.array([0.0, 0.0, 1.0])
     orbit = quaternion_to_matrix(quaternion_from_axis_angle(up, around * ORBIT))
     tilt = quaternion_to_matrix(quaternion_from_axis_angle(orbit @ pose[:3, 0], over * TILT))
     turn = tilt @ orbit
     position = MIDDLE + (1 + far * DISTANCE) * (turn @ (pose[:3, 3] - MIDDLE))
     moved = pose.at[:3, :3].set(turn @ pose[:3, :3]).at[:3, 3].set(position)
-    return dataclasses.replace(camera, world_from_camera=moved)
+    return start.replace(camera=dataclasses.replace(start.camera, world_from_camera=moved))
+
+
+_FUNCTIONS: dict[str, Callable[[Scene, Array, Start], Start]] = {
+    "instance": other_instance,
+    "position": other_position,
+    "background": other_background,
+    "camera": other_view,
+}
+SHIFTS = tuple(_FUNCTIONS)
 
 
 def _is_of_task(model: mujoco.MjModel, geom: int) -> bool:

@@ -21,7 +21,8 @@ __all__ = [
 ]
 
 _MODULES = [importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
-TASKS: dict[str, Task] = {module.TASK.name: module.TASK for module in _MODULES if hasattr(module, "TASK")}
+_FOUND = [vars(module).get("TASK") for module in _MODULES]
+TASKS: dict[str, Task] = {task.name: task for task in _FOUND if isinstance(task, Task)}
 
 
 def get_task(name: str) -> Task:

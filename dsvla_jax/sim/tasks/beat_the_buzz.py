@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.geometry import rotations
-from dsvla_jax.sim.robot import OBJECT
+from dsvla_jax.sim.robot import OBJECT, VISUAL
 from dsvla_jax.sim.tasks import task
 from dsvla_jax.types import TABLE_HEIGHT, Action, Array
 
@@ -21,7 +22,7 @@ BEYOND, ASIDE = 0.16, 0.06
 APPROACH, LEAVE = 0.1, END - 0.06  # the expert's height over its grasp, and where along the wire's line it lets go
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "buzz")
     copper, board, rest = [0.85, 0.5, 0.25, 1], [0.15, 0.25, 0.5, 1], [0.85, 0.85, 0.85, 1]
     task.add_part(root, "buzz_board", task.BOX, [0.06, 0.105, 0.012], [0, 0.07, 0.012], board)
@@ -39,9 +40,9 @@ def _build(spec) -> None:
     corners = np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=-1) * RING
     for i in range(SEGMENTS):
         # Of the ring, the lowest segment collides: it lies on the table with the handle.
-        bits = {"collision": OBJECT} if i == 0 else {}
-        segment = {"fromto": [*corners[i], *corners[i + 1]], "mass": 0.005, **bits}
-        task.add_part(wand, f"wand_ring{i}", task.CAPSULE, [TUBE], [0, 0, 0], steel, **segment)
+        bits = OBJECT if i == 0 else VISUAL
+        segment = {"fromto": [*corners[i], *corners[i + 1]], "mass": 0.005}
+        task.add_part(wand, f"wand_ring{i}", task.CAPSULE, [TUBE], [0, 0, 0], steel, bits, **segment)
     neck = {"fromto": [0, 0, RING, 0, 0, HANDLE_LOW]}
     task.add_part(wand, "wand_neck", task.CAPSULE, [TUBE], [0, 0, 0], steel, **neck)
     handle = {"fromto": [0, 0, HANDLE_LOW + HANDLE, 0, 0, HANDLE_HIGH], "mass": 0.05}
@@ -85,7 +86,7 @@ def _expert(view: task.StateView) -> Action:
     grasp = task.point_in_world(view.body_pose("wand"), (0.0, 0.0, GRASP))
     leave = task.point_in_world(root, (0.0, LEAVE, HEIGHT + GRASP))
     grippers = [task.OPEN, task.CLOSED, task.OPEN]
-    return task.key_poses([grasp.at[2].add(APPROACH), grasp, leave], grippers, task.pointing_down(task.yaw_of(root)))
+    return task.keyframes([grasp.at[2].add(APPROACH), grasp, leave], grippers, task.pointing_down(task.yaw_of(root)))
 
 
 TASK = task.Task(

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import OBJECT
 from dsvla_jax.sim.tasks import task
@@ -11,11 +12,11 @@ RADIUS = 0.1
 LIFTED = 0.95  # height of the ball's centre, metres
 # Straight down and turned by a quarter, so that an open gripper meets the ball with the sides of both its fingers.
 SIDEWAYS = (0.70710678, -0.70710678, 0.0, 0.0)
-# The key poses of each arm: distance from the ball's centre along y, and height over it.
+# The keyframes of each arm: distance from the ball's centre along y, and height over it.
 KEYFRAMES = ((0.22, -0.01), (0.15, -0.01), (0.08, -0.01), (0.08, 0.24))
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     ball = task.add_object(spec, "ball", RADIUS, damping=1e-3)
     orange = [0.9, 0.45, 0.1, 1]
     task.add_part(ball, "ball", task.SPHERE, [RADIUS], [0, 0, 0], orange, OBJECT, mass=0.15)
@@ -42,8 +43,8 @@ def _expert(view: task.StateView) -> Action:
     sideways, height = jnp.asarray(KEYFRAMES, jnp.float32).T
     offsets = jnp.stack([jnp.zeros_like(sideways), sideways, height], axis=-1)
     mirrored = offsets * jnp.array([1.0, -1.0, 1.0])
-    left = task.key_poses(centre + offsets, [task.OPEN] * len(KEYFRAMES), SIDEWAYS)
-    right = task.key_poses(centre + mirrored, [task.OPEN] * len(KEYFRAMES), SIDEWAYS)
+    left = task.keyframes(centre + offsets, [task.OPEN] * len(KEYFRAMES), SIDEWAYS)
+    right = task.keyframes(centre + mirrored, [task.OPEN] * len(KEYFRAMES), SIDEWAYS)
     return task.both_arms(left, right)
 
 

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import CollisionBits
 from dsvla_jax.sim.tasks import task
@@ -14,7 +15,7 @@ HANDLE, HANDLE_HALF, HANDLE_RADIUS = 0.19, 0.05, 0.01
 LIFTED = 1.2  # height of the tray and of the item, metres
 # The arms lean this far outwards from straight down, which keeps the hands beside the tray, and so the item in view.
 LEAN = 0.7
-# The key poses over a handle: how far outwards and how high. Lifted at once, the item would take off as the tray stops.
+# The keyframes over a handle: how far outwards and how high. Lifted at once, the item would take off as the tray stops.
 KEYFRAMES = ((0.06, 0.06), (0.0, 0.0), (0.0, 0.19), (0.0, 0.38))
 
 # The hands meet the handles alone: more pairs that collide would cost time at every step.
@@ -22,7 +23,7 @@ STAND_BITS, FLOOR_BITS, ITEM_BITS = CollisionBits(8, 0), CollisionBits(8, 9), Co
 HANDLE_BITS = CollisionBits(0, 4)
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     stand = task.add_furniture(spec, "stand")
     pine, oak, steel = [0.8, 0.68, 0.5, 1], [0.45, 0.25, 0.13, 1], [0.75, 0.77, 0.8, 1]
     task.add_part(stand, "stand", task.BOX, [0.07, 0.11, STAND / 2], [0, 0, STAND / 2], pine, STAND_BITS)
@@ -82,7 +83,7 @@ def _expert(view: task.StateView) -> Action:
         offsets = jnp.stack([jnp.zeros_like(outwards), sign * (HANDLE + outwards), height], axis=-1)
         positions = jax.vmap(lambda offset: task.point_in_world(tray, offset))(offsets)
         grippers = [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED]
-        arms.append(task.key_poses(positions, grippers, task.leaning(-sign * LEAN, task.yaw_of(tray))))
+        arms.append(task.keyframes(positions, grippers, task.leaning(-sign * LEAN, task.yaw_of(tray))))
     return task.both_arms(*arms)
 
 

@@ -8,6 +8,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import OBJECT_AND_FIXTURE, CollisionBits
 from dsvla_jax.sim.tasks import task
@@ -28,7 +29,7 @@ BESIDE, PUSH, HELD, LIFT = 0.07, 0.05, 0.015, 0.2
 HOLDER_BITS = CollisionBits(8, 0)  # holds the laptop up; the fingers that meet it too would cost time at every step
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     holder = task.add_furniture(spec, "laptop_holder")
     wood = [0.55, 0.38, 0.22, 1]
     x, y, z = HOLDER
@@ -82,8 +83,8 @@ def _expert(view: task.StateView) -> Action:
     waiting = at(front - BESIDE)
     right = [waiting, waiting, at(front + HELD), at(front + HELD, LIFT)]
     return task.both_arms(
-        task.key_poses(left, [task.CLOSED] * 4, task.leaning(-LEAN, yaw)),
-        task.key_poses(right, [task.OPEN, task.OPEN, task.CLOSED, task.CLOSED], task.leaning(LEAN, yaw)),
+        task.keyframes(left, [task.CLOSED] * 4, task.leaning(-LEAN, yaw)),
+        task.keyframes(right, [task.OPEN, task.OPEN, task.CLOSED, task.CLOSED], task.leaning(LEAN, yaw)),
     )
 
 

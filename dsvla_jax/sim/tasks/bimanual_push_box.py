@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import OBJECT
 from dsvla_jax.sim.tasks import task
@@ -17,7 +18,7 @@ SIDE, NEAR = 0.1, 0.05  # half an edge of the square; how far from its middle th
 HAND, PUSH_HEIGHT, CLEARANCE, PAD = 0.13, 0.056, 0.06, 0.01
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     square = task.add_furniture(spec, "target")
     task.add_part(square, "target", task.BOX, [SIDE, SIDE, 0.001], [0, 0, 0.001], [0.85, 0.1, 0.1, 1])
 
@@ -64,7 +65,7 @@ def _expert(view: task.StateView) -> Action:
     for y in (HAND, -HAND):
         behind = task.point_in_world(box, (contact - CLEARANCE, y, PUSH_HEIGHT - HEIGHT))
         pushed = task.point_in_world(square, (contact, y, PUSH_HEIGHT))
-        arms.append(task.key_poses([behind, pushed], [task.OPEN, task.OPEN], turn))
+        arms.append(task.keyframes([behind, pushed], [task.OPEN, task.OPEN], turn))
     return task.both_arms(*arms)
 
 

@@ -5,6 +5,7 @@ The rope is a chain of capsules with upright hinges: it bends in the plane of th
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.geometry import rotations
 from dsvla_jax.sim.robot import OBJECT, CollisionBits
@@ -27,7 +28,7 @@ TARGETS = ("rope_tail_target", "rope_head_target")
 MIDDLE_BITS = CollisionBits(0, 1)  # lies on the table; the ends alone meet the fingers
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     for name in TARGETS:
         square = task.add_furniture(spec, name)
         task.add_part(square, name, task.BOX, [SQUARE, SQUARE, 0.001], [0, 0, 0.001], [0.1, 0.7, 0.2, 1])
@@ -104,7 +105,7 @@ def _expert(view: task.StateView) -> Action:
         )
         positions = [point.at[2].set(TABLE_HEIGHT + z) for point, z in ((end, ABOVE), (end, GRASP), (square, GRASP))]
         grippers = [task.OPEN, task.CLOSED, task.OPEN]
-        arms.append(task.key_poses(positions, grippers, turns[jnp.array([0, 0, 1])]))
+        arms.append(task.keyframes(positions, grippers, turns[jnp.array([0, 0, 1])]))
     return task.both_arms(*arms)
 
 

@@ -5,6 +5,7 @@ The knob is on the minute hand itself, so that knob and dial are seen together.
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.sim.robot import FIXTURE
@@ -17,13 +18,13 @@ HAND, KNOB, KNOB_RADIUS, KNOB_TIP = 0.08, 0.055, 0.01, 0.062  # the hand's lengt
 # Angles of the minute hand, clockwise from twelve, radians: at the start, and to which within what it must be turned.
 START, QUARTER, TOLERANCE = (-1.2, -0.2), np.pi / 2, 0.12
 # The expert: how far in front of the root and below the knob it holds, so that the palm stays in front of the dial and
-# above the knob; from what height it comes; on how many key poses it turns the hand; and how much farther than to the
+# above the knob; from what height it comes; on how many keyframes it turns the hand; and how much farther than to the
 # quarter, as the knob slips a little between the fingers.
 OUT, BELOW, ABOVE, TURNS, BEYOND = 0.052, 0.01, 0.1, 4, 0.09
 FACING = [0.70710678, 0.0, 0.70710678, 0.0]  # a cylinder's axis along x, wxyz
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "clock")
     white, frame, black, wood = [0.96, 0.95, 0.9, 1], [0.15, 0.25, 0.45, 1], [0.08, 0.08, 0.1, 1], [0.75, 0.5, 0.2, 1]
     centre = [0, 0, CENTRE]
@@ -90,7 +91,7 @@ def _expert(view: task.StateView) -> Action:
     positions = [above, *[_at_knob(view, angle, OUT, -BELOW) for angle in angles]]
     # The fingers open along the dial and the palm is parallel to it; the knob turns between the fingers.
     turn = task.pointing_down(task.yaw_of(view.body_pose("clock")))
-    return task.key_poses(positions, [task.OPEN, *[task.CLOSED] * TURNS, task.OPEN], turn)
+    return task.keyframes(positions, [task.OPEN, *[task.CLOSED] * TURNS, task.OPEN], turn)
 
 
 TASK = task.Task(

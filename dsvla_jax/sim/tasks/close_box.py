@@ -6,6 +6,7 @@ much larger sideways than forwards.
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.geometry import rotations
 from dsvla_jax.sim.robot import FIXTURE
@@ -22,7 +23,7 @@ GRASP, CLEARANCE = LENGTH - 0.018, 0.09
 ANGLES = (2.7, 2.1, 1.5, 0.95)
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "box")
     brown, light, dark = [0.85, 0.65, 0.38, 1], [0.95, 0.86, 0.68, 1], [0.55, 0.35, 0.18, 1]
     y, z = -LENGTH / 2, HEIGHT / 2
@@ -81,7 +82,7 @@ def _expert(view: task.StateView) -> Action:
     turns = rotations.quaternion_multiply(
         view.body_pose("box")[3:], rotations.quaternion_multiply(tilts, rotations.DOWN)
     )
-    return task.key_poses(positions, [task.OPEN, *[task.CLOSED] * 3, task.OPEN, task.OPEN], turns)
+    return task.keyframes(positions, [task.OPEN, *[task.CLOSED] * 3, task.OPEN, task.OPEN], turns)
 
 
 TASK = task.Task(

@@ -6,6 +6,7 @@ stands between the robot, which pushes its outer face, and the front camera, whi
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import FIXTURE
 from dsvla_jax.sim.tasks import task
@@ -21,7 +22,7 @@ HANDLE = 0.19  # distance from the hinge, metres
 PUSH_HEIGHT, PUSH_RADIUS, CLEARANCE, END_ANGLE, PAD = 0.31, 0.16, 0.09, 0.25, 0.01
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "fridge")
     silver, inside, dark = [0.75, 0.77, 0.8, 1], [0.93, 0.95, 0.97, 1], [0.2, 0.2, 0.22, 1]
     x, y, wall, middle = WIDTH / 2, DEPTH / 2 + THICKNESS, 0.006, (HEIGHT + SPLIT) / 2
@@ -77,7 +78,7 @@ def _success(view: task.StateView) -> Array:
 def _expert(view: task.StateView) -> Action:
     beside = _on_door(view, view.joint("fridge_door"), PUSH_RADIUS, THICKNESS + CLEARANCE, PUSH_HEIGHT)
     pushed = _on_door(view, END_ANGLE, PUSH_RADIUS, THICKNESS + PAD, PUSH_HEIGHT)
-    return task.key_poses([beside, pushed], [task.OPEN, task.OPEN])
+    return task.keyframes([beside, pushed], [task.OPEN, task.OPEN])
 
 
 TASK = task.Task(

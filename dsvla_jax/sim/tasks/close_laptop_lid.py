@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import FIXTURE
 from dsvla_jax.sim.tasks import task
@@ -18,7 +19,7 @@ OPEN_ANGLE, CLOSED_BY = 1.85, 1.79  # radians: how far the lid stands open, and 
 RADIUS, CLEARANCE, ABOVE, PAD, PUSHED_ANGLE, PRESS = 0.125, 0.06, 0.12, 0.012, 1.0, 0.01
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "laptop")
     silver, dark, black = [0.78, 0.8, 0.83, 1], [0.12, 0.12, 0.14, 1], [0.2, 0.2, 0.22, 1]
     x, y, top = WIDTH / 2, DEPTH / 2, HINGE[1]
@@ -75,7 +76,7 @@ def _expert(view: task.StateView) -> Action:
     pushed = _on_lid(view, PUSHED_ANGLE, RADIUS, PAD)
     pressed = _on_lid(view, 0.0, RADIUS, -PRESS)
     above = behind + jnp.array([0.0, 0.0, ABOVE])
-    return task.key_poses([above, behind, pushed, pressed], [task.CLOSED] * 4)
+    return task.keyframes([above, behind, pushed, pressed], [task.CLOSED] * 4)
 
 
 TASK = task.Task(

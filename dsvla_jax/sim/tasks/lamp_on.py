@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import FIXTURE
 from dsvla_jax.sim.tasks import task
@@ -11,11 +12,11 @@ BUTTON = (0.0, 0.12, 0.045)  # the top of the released button, in the frame of t
 LAMP = (0.0, -0.09)  # the foot of the lamp
 TRAVEL = 0.012
 PRESSED = 0.003
-# Heights of the two key poses over the button, metres. The press is so deep that it works when given 2 cm too high.
+# Heights of the two keyframes over the button, metres. The press is so deep that it works when given 2 cm too high.
 ABOVE, PRESS = 0.10, -0.03
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "lamp")
     x, y, top = BUTTON
     # The lamp is only looked at: colliding, it would cost contacts at every step.
@@ -56,7 +57,7 @@ def _success(view: task.StateView) -> Array:
 def _expert(view: task.StateView) -> Action:
     button = _button(view)
     heights = jnp.array([[0.0, 0.0, ABOVE], [0.0, 0.0, PRESS]])
-    return task.key_poses(button + heights, [task.CLOSED, task.CLOSED])
+    return task.keyframes(button + heights, [task.CLOSED, task.CLOSED])
 
 
 TASK = task.Task(

@@ -5,6 +5,7 @@ The front looks to the robot's right and to the camera; the hand comes from abov
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.geometry import rotations
@@ -24,7 +25,7 @@ ABOVE, GRASP = 0.28, 0.155
 ANGLES = (0.0, 0.4, 0.8, 1.2, 1.56)
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "microwave")
     white, grey, dark, glass = [0.92, 0.92, 0.9, 1], [0.6, 0.6, 0.62, 1], [0.15, 0.15, 0.17, 1], [0.2, 0.25, 0.3, 1]
     # The back of the door touches the case at y = THICKNESS.
@@ -96,7 +97,7 @@ def _expert(view: task.StateView) -> Action:
     turns = rotations.quaternion_multiply(
         rotations.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw - angles + jnp.pi / 2), rotations.DOWN
     )
-    return task.key_poses(positions, [task.OPEN, *[task.CLOSED] * len(ANGLES)], turns)
+    return task.keyframes(positions, [task.OPEN, *[task.CLOSED] * len(ANGLES)], turns)
 
 
 TASK = task.Task(

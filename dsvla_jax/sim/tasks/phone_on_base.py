@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import FIXTURE, OBJECT_AND_FIXTURE
 from dsvla_jax.sim.tasks import task
@@ -18,7 +19,7 @@ TOLERANCE = (0.04, 0.03, 0.02)  # of the handset's place on the base that counts
 APPROACH, LIFT = 0.10, 0.16  # metres over the handset where it lies
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     base = task.add_furniture(spec, "phone_base")
     red, white, grey, dark = [0.8, 0.12, 0.1, 1], [0.93, 0.92, 0.88, 1], [0.5, 0.51, 0.54, 1], [0.2, 0.2, 0.22, 1]
     top = 2 * BASE_SIZE[2]
@@ -85,7 +86,7 @@ def _expert(view: task.StateView) -> Action:
     positions = [handle + APPROACH * up, handle, handle + LIFT * up, cradle + APPROACH * up, cradle + 0.005 * up]
     grasp, place = task.pointing_down(task.yaw_of(view.body_pose("phone"))), task.pointing_down(task.yaw_of(base))
     turns = jnp.stack([grasp, grasp, grasp, place, place])
-    return task.key_poses(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED, task.OPEN], turns)
+    return task.keyframes(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED, task.OPEN], turns)
 
 
 TASK = task.Task(

@@ -5,6 +5,7 @@ The rack's slots lie side by side and slope down away from the front camera, tow
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.geometry import rotations
@@ -31,7 +32,7 @@ def _turn_y(angle: float) -> Array:
     return rotations.quaternion_from_axis_angle(jnp.array([0.0, 1.0, 0.0]), jnp.float32(angle))
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     rack = task.add_furniture(spec, "wine_rack")
     wood, dark = [0.75, 0.52, 0.28, 1], [0.4, 0.24, 0.12, 1]
     width, gap = 1.5 * SLOTS["left"], SLOTS["left"] / 2
@@ -109,7 +110,7 @@ def _expert(view: task.StateView) -> Action:
     up = jnp.array([0.0, 0.0, LIFT])
     positions = [neck - BACK * approach, neck, neck + up, _in_slot(view, GRASP + INSERT, ABOVE), _in_slot(view, GRASP)]
     grippers = [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED, task.OPEN]
-    return task.key_poses(positions, grippers, jnp.stack([grasp] * 3 + [lay] * 2))
+    return task.keyframes(positions, grippers, jnp.stack([grasp] * 3 + [lay] * 2))
 
 
 TASK = task.Task(

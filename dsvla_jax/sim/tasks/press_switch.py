@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.sim.robot import FIXTURE
@@ -17,7 +18,7 @@ OFF, FLICKED = -0.6, 1.0  # the lever's angle at the start, and how far it must 
 OUT, BELOW, BEGIN, END, ABOVE = 0.04, 0.015, -0.085, 0.006, 0.1
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "switch")
     wood, white, grey, red = [0.8, 0.75, 0.62, 1], [0.96, 0.96, 0.96, 1], [0.35, 0.35, 0.38, 1], [0.85, 0.12, 0.1, 1]
     half, height = BOARD
@@ -64,7 +65,7 @@ def _expert(view: task.StateView) -> Action:
     places = np.array([[OUT, BEGIN, low + ABOVE], [OUT, BEGIN, low], [OUT, END, low]])
     positions = [task.point_in_world(switch, place) for place in places]
     # The palm is parallel to the board.
-    return task.key_poses(positions, [task.CLOSED] * 3, task.pointing_down(task.yaw_of(switch)))
+    return task.keyframes(positions, [task.CLOSED] * 3, task.pointing_down(task.yaw_of(switch)))
 
 
 TASK = task.Task(

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.geometry import rotations
@@ -21,7 +22,7 @@ BOARD_SIZE = (0.12, 0.085, 0.009)  # half extents
 APPROACH, PULL, OVER = 0.09, 0.13, 0.12  # metres before the handle, along the knife, and over the board
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     block = task.add_furniture(spec, "knife_block")
     walnut, dark, maple = [0.33, 0.18, 0.09, 1], [0.08, 0.08, 0.09, 1], [0.93, 0.82, 0.6, 1]
     level = [float(np.cos(SLANT / 2)), 0.0, float(np.sin(SLANT / 2)), 0.0]
@@ -114,7 +115,7 @@ def _expert(view: task.StateView) -> Action:
         task.point_in_world(board, laid),
     ]
     turns = jnp.stack([grasp, grasp, grasp, place, place])
-    return task.key_poses(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED, task.OPEN], turns)
+    return task.keyframes(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED, task.OPEN], turns)
 
 
 TASK = task.Task(

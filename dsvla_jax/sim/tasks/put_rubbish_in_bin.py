@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.sim.robot import FIXTURE, OBJECT_AND_FIXTURE
@@ -19,7 +20,7 @@ APPROACH, GRASP, CARRY = 0.12, 0.022, 0.22
 OBJECTS = ("rubbish", "rubbish_tomato_left", "rubbish_tomato_right")
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     bin_body = task.add_furniture(spec, "rubbish_bin")
     black = [0.12, 0.12, 0.13, 1]
     middle, outer = INSIDE + WALL, INSIDE + 2 * WALL
@@ -81,7 +82,7 @@ def _expert(view: task.StateView) -> Action:
         return pose[:3].at[2].set(TABLE_HEIGHT + height)
 
     positions = [over(rubbish, APPROACH), over(rubbish, GRASP), over(rubbish, CARRY), over(bin_pose, CARRY)]
-    return task.key_poses(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.OPEN])
+    return task.keyframes(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.OPEN])
 
 
 TASK = task.Task(

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.geometry import rotations
@@ -22,13 +23,13 @@ JITTER = (0.012, 0.008)
 # A block counts as stacked within these distances of its place in the tower, sideways and in height.
 SIDEWAYS, HEIGHT = 0.035, 0.012
 APPROACH, CARRY, DROP = 0.10, 0.09, 0.004  # metres over a block, over the top of the tower, and when let go
-POSES = 6  # key poses a block
+POSES = 6  # keyframes a block
 
 # A distractor is no part of any stack: its box stands on the table, the fingers feel a ball inside it.
 TABLE_ONLY = CollisionBits(0, 1)
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     square = task.add_furniture(spec, "stack_square")
     task.add_part(square, "stack_square", task.BOX, [SQUARE, SQUARE, 0.0005], [0, 0, 0.0005], [0.5, 0.9, 0.5, 1])
     for name in TARGETS + DISTRACTORS:

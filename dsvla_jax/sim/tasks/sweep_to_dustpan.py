@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.sim.robot import OBJECT, CollisionBits
@@ -23,7 +24,7 @@ GRASP, HOVER, APPROACH = 0.21, 0.003, 0.1  # heights of the grasp, of the waitin
 SWEEP_FROM, SWEEP_TO = 0.115, -0.13  # where along y the broom begins and ends
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     pan = task.add_furniture(spec, "dustpan")
     dark, wood, straw = [0.2, 0.22, 0.28, 1], [0.3, 0.16, 0.08, 1], [0.85, 0.7, 0.35, 1]
     x, y = PAN_HALF
@@ -91,7 +92,7 @@ def _expert(view: task.StateView) -> Action:
     ends = [task.point_in_world(pan, (0.0, y - PAN[1], GRASP + HOVER)) for y in (SWEEP_FROM, SWEEP_TO)]
     grippers = [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED]
     positions = [handle.at[2].add(APPROACH), handle, *ends]
-    return task.key_poses(positions, grippers, task.pointing_down(task.yaw_of(pan)))
+    return task.keyframes(positions, grippers, task.pointing_down(task.yaw_of(pan)))
 
 
 TASK = task.Task(

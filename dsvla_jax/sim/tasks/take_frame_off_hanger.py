@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.geometry import rotations
 from dsvla_jax.sim.robot import OBJECT
@@ -22,7 +23,7 @@ ACROSS = (0.70710678, -0.70710678, 0.0, 0.0)  # straight down, one finger before
 LANDING = (PULL, 0.0, 0.01)
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "hanger")
     plaster, steel, wood = [0.55, 0.68, 0.72, 1], [0.25, 0.25, 0.27, 1], [0.35, 0.17, 0.07, 1]
     top = (HANGS + HALF + 0.025) / 2
@@ -78,7 +79,7 @@ def _expert(view: task.StateView) -> Action:
     out = task.point_in_world(root, (PULL, 0.0, 0.0)) - root[:3]
     down = jnp.array([0.0, 0.0, HALF + DROP - HANGS])
     positions = [grip + jnp.array([0.0, 0.0, APPROACH]), grip, grip + out, grip + out + down]
-    return task.key_poses(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.OPEN], quaternion)
+    return task.keyframes(positions, [task.OPEN, task.CLOSED, task.CLOSED, task.OPEN], quaternion)
 
 
 TASK = task.Task(

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.sim.robot import FIXTURE, OBJECT_AND_FIXTURE
@@ -21,7 +22,7 @@ NEAR = 0.1  # half an edge of the square around BESIDE where the pepper is to be
 APPROACH, CARRY, PLACE = 0.1, TRAY + 0.12, PEPPER + 0.006
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     scales = task.add_furniture(spec, "scales")
     body, steel, black = [0.2, 0.42, 0.5, 1], [0.78, 0.8, 0.82, 1], [0.1, 0.1, 0.1, 1]
     task.add_part(scales, "scales_foot", task.BOX, [0.075, 0.075, 0.01], [0, 0, 0.01], black)
@@ -85,7 +86,7 @@ def _expert(view: task.StateView) -> Action:
     over, lifted = pepper.at[2].add(APPROACH), pepper.at[2].set(TABLE_HEIGHT + CARRY)
     positions = [over, pepper, lifted, _beside(view, CARRY), _beside(view, PLACE)]
     grippers = [task.OPEN, task.CLOSED, task.CLOSED, task.CLOSED, task.OPEN]
-    return task.key_poses(positions, grippers, task.pointing_down(task.yaw_of(view.body_pose("scales"))))
+    return task.keyframes(positions, grippers, task.pointing_down(task.yaw_of(view.body_pose("scales"))))
 
 
 TASK = task.Task(

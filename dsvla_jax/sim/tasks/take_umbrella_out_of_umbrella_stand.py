@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import OBJECT, OBJECT_AND_FIXTURE, SURFACE
 from dsvla_jax.sim.tasks import task
@@ -16,7 +17,7 @@ GRASP = 0.25  # height of the tool centre point along the umbrella: what is abov
 APPROACH, LIFT = 0.08, 0.225  # metres over the grasp
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     stand = task.add_furniture(spec, "umbrella_stand")
     grey, blue, tan = [0.35, 0.36, 0.4, 1], [0.12, 0.25, 0.8, 1], [0.85, 0.62, 0.3, 1]
     middle, outer = INSIDE + WALL, INSIDE + 2 * WALL
@@ -61,7 +62,7 @@ def _expert(view: task.StateView) -> Action:
     positions = [
         task.point_in_world(umbrella, (0.0, 0.0, height)) for height in (GRASP + APPROACH, GRASP, GRASP + LIFT)
     ]
-    return task.key_poses(positions, [task.OPEN, task.CLOSED, task.CLOSED], task.pointing_down(task.yaw_of(umbrella)))
+    return task.keyframes(positions, [task.OPEN, task.CLOSED, task.CLOSED], task.pointing_down(task.yaw_of(umbrella)))
 
 
 TASK = task.Task(

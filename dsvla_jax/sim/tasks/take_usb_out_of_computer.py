@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import FIXTURE, OBJECT
 from dsvla_jax.sim.tasks import task
@@ -18,7 +19,7 @@ OUT = 0.03  # how far from its port the stick counts as taken out
 APPROACH, PULL, RELEASE = 0.08, 0.1, 0.02  # metres over the stick, out of the port, and over the table
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     computer = task.add_furniture(spec, "usb_computer")
     dark, panel, black = [0.22, 0.23, 0.26, 1], [0.5, 0.52, 0.56, 1], [0.05, 0.05, 0.06, 1]
     x, y, z = COMPUTER_SIZE
@@ -78,7 +79,7 @@ def _expert(view: task.StateView) -> Action:
     offsets = ((0.0, 0.0, APPROACH), (0.0, 0.0, 0.0), (PULL, 0.0, 0.0), (PULL, 0.0, RELEASE - PLUGGED[2]))
     positions = [task.point_in_world(stick, offset) for offset in offsets]
     grippers = [task.OPEN, task.CLOSED, task.CLOSED, task.OPEN]
-    return task.key_poses(positions, grippers, task.pointing_down(task.yaw_of(stick)))
+    return task.keyframes(positions, grippers, task.pointing_down(task.yaw_of(stick)))
 
 
 TASK = task.Task(

@@ -6,18 +6,18 @@ All functions of a task are per example and pure jnp; vmap them over episodes.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from jax.typing import ArrayLike
 
 from dsvla_jax.geometry import rotations
 from dsvla_jax.sim.kinematics import forward_kinematics
-from dsvla_jax.sim.robot import VISUAL, Arm
+from dsvla_jax.sim.robot import VISUAL, Arm, CollisionBits
 from dsvla_jax.types import TABLE_HEIGHT, Action, Array
 
 BOX = mujoco.mjtGeom.mjGEOM_BOX
@@ -31,12 +31,14 @@ INVISIBLE_GROUP = 3  # geoms of this group collide but are not drawn
 
 OPEN, CLOSED = 1.0, 0.0
 
+Floats = Sequence[float] | np.ndarray
+
 
 @dataclasses.dataclass(frozen=True)
 class LinkJoint:
     """A hinge or a slide. address: in qpos. axis, anchor: in its body's frame. zero: the value it was built at."""
 
-    kind: Any
+    kind: mujoco.mjtJoint
     address: int
     axis: tuple[float, ...]
     anchor: tuple[float, ...]
@@ -67,12 +69,23 @@ class StateLayout:
     __hash__ = object.__hash__
     __eq__ = object.__eq__
 
-    def address(self, table: str, name: str) -> int:
-        """The address of ``name`` in ``free``, ``mocap`` or ``joints``; an error that lists what there is."""
-        known: Mapping[str, int] = getattr(self, table)
-        if name not in known:
-            raise KeyError(f"no {table} entry {name!r} in this scene; it has {sorted(known)}")
-        return known[name]
+    def free_address(self, body: str) -> int:
+        """Returns where the pose of a loose body begins in qpos. Raises KeyError with the names that the scene has."""
+        return _find(self.free, body, "loose body")
+
+    def mocap_index(self, body: str) -> int:
+        """Returns the row of a piece of furniture in mocap_pos and mocap_quat. Raises KeyError as `free_address`."""
+        return _find(self.mocap, body, "furniture")
+
+    def joint_address(self, joint: str) -> int:
+        """Returns where the value of a hinge or slide is in qpos. Raises KeyError as `free_address`."""
+        return _find(self.joints, joint, "joint")
+
+
+def _find(known: Mapping[str, int], name: str, kind: str) -> int:
+    if name not in known:
+        raise KeyError(f"no {kind} {name!r} in this scene; it has {', '.join(sorted(known)) or 'none'}")
+    return known[name]
 
 
 @struct.dataclass
@@ -99,7 +112,7 @@ class StateView:
             return jnp.concatenate([self.mocap_pos[i], rotations.quaternion_from_wxyz(self.mocap_quat[i])])
         if name in self.layout.links:
             return self._link_pose(self.layout.links[name])
-        address = self.layout.address("free", name)
+        address = self.layout.free_address(name)
         pose = jax.lax.dynamic_slice_in_dim(self.qpos, address, 7)
         return jnp.concatenate([pose[:3], rotations.quaternion_from_wxyz(pose[3:])])
 
@@ -120,7 +133,7 @@ class StateView:
 
     def joint(self, name: str) -> Array:
         """The value () of a hinge (radians) or a slide (metres)."""
-        return self.qpos[self.layout.address("joints", name)]
+        return self.qpos[self.layout.joint_address(name)]
 
     def tool_poses(self) -> Array:
         """The poses (A, 7) of the tool centre points."""
@@ -199,7 +212,7 @@ class Task:
 
     build: adds the task's bodies to an MjSpec that has the table; names begin with the task's own words.
     sample: (PRNG key, variation int32 ()) -> Placement.
-    instructions: ways to say the task, the plain one first; {words} in braces are filled in by ``words``.
+    instructions: paraphrases of the task, the plain one first; {words} in braces are filled in by ``words``.
     objects: what the instruction names, in its order: what keypoints found in pictures are of. Of several equal objects
         (blocks of one colour) one.
     recognised_by: a regular expression that recognises the task in an instruction of other words, lower case. Tasks are
@@ -207,7 +220,7 @@ class Task:
     keypoints: view -> float32 (A, K, 3), for each arm the points to go to, in the order of the instruction. A task with
         fewer in some variations repeats the last one.
     success: view -> bool (), after every physics step.
-    expert: view at reset -> Action with a leading axis M: the key poses of a demonstration. A variation that needs
+    expert: view at reset -> Action with a leading axis M: the keyframes of a demonstration. A variation that needs
         fewer repeats the last one.
     variations: how many there are. words: variation -> what fills the braces of the instructions.
     exclusive: whether acting out one variation never succeeds at another. Not so where they differ in looks, or in a
@@ -224,7 +237,7 @@ class Task:
 
     name: str
     num_arms: int
-    build: Callable[[Any], None]
+    build: Callable[[mujoco.MjSpec], None]
     sample: Callable[[Array, Array], Placement]
     instructions: tuple[str, ...]
     keypoints: Callable[[StateView], Array]
@@ -245,14 +258,16 @@ class Task:
     attachments: tuple[Attachment, ...] = ()
     release: Callable[[StateView], Array] = never
 
-    def say(self, variation: int, way: int = 0) -> str:
-        """The instruction of a variation, in one of the ways (counted round)."""
-        return self.instructions[way % len(self.instructions)].format(**self.words(variation))
+    def say(self, variation: int, paraphrase: int = 0) -> str:
+        """Returns the instruction of a variation in one of its paraphrases (counted round)."""
+        return self.instructions[paraphrase % len(self.instructions)].format(**self.words(variation))
 
     def all_instructions(self) -> list[str]:
-        """Every way to say every variation."""
+        """Returns every paraphrase of every variation."""
         return [
-            self.say(variation, way) for variation in range(self.variations) for way in range(len(self.instructions))
+            self.say(variation, paraphrase)
+            for variation in range(self.variations)
+            for paraphrase in range(len(self.instructions))
         ]
 
     def phrases(self, words: Mapping[str, str]) -> tuple[tuple[str, ...], ...]:
@@ -273,12 +288,19 @@ def fill(text: str, words: Mapping[str, str]) -> str:
 
 
 def add_part(
-    body: Any, name: str, shape: Any, size: Any, pos: Any, rgba: Any, collision: Any = VISUAL, **more: Any
-) -> Any:
-    """Adds a geom to an MjsBody: half extents or (radius, half length) ``size``, metres.
+    body: mujoco.MjsBody,
+    name: str,
+    shape: mujoco.mjtGeom,
+    size: Floats,
+    pos: Floats,
+    rgba: Floats,
+    collision: CollisionBits = VISUAL,
+    /,
+    **more: float | Floats,
+) -> mujoco.MjsGeom:
+    """Adds a geom to a body: half extents or (radius, half length) ``size``, metres. more: other fields of the geom.
 
-    By default it is only looked at and weighs nothing; ``collision``, a CollisionBits, makes it one that collides, of
-    ``mass`` kilograms.
+    By default it is only looked at and weighs nothing; ``collision`` makes it one that collides, of ``mass`` kilograms.
     """
     size = [*size, *[0.0] * (3 - len(size))]
     if collision == VISUAL:
@@ -287,12 +309,12 @@ def add_part(
     return body.add_geom(name=name, type=shape, size=size, pos=list(pos), rgba=list(rgba), **bits, **more)
 
 
-def add_furniture(spec: Any, name: str) -> Any:
-    """Adds a body without weight that stands where the placement puts it (a mocap body). Returns the MjsBody."""
+def add_furniture(spec: mujoco.MjSpec, name: str) -> mujoco.MjsBody:
+    """Adds a body without weight that stands where the placement puts it (a mocap body)."""
     return spec.worldbody.add_body(name=name, mocap=True, pos=[0.0, 0.0, TABLE_HEIGHT])
 
 
-def add_object(spec: Any, name: str, height: float, damping: float = 0.0) -> Any:
+def add_object(spec: mujoco.MjSpec, name: str, height: float, damping: float = 0.0) -> mujoco.MjsBody:
     """Adds a loose body whose origin begins ``height`` metres above the table. ``damping`` slows moving and rolling."""
     body = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, TABLE_HEIGHT + height])
     joint = body.add_freejoint(name=name)
@@ -329,7 +351,7 @@ def yaw_of(pose: Array) -> Array:
     return jnp.arctan2(y, x)
 
 
-def point_in_world(pose: Array, point: Any) -> Array:
+def point_in_world(pose: Array, point: ArrayLike | Floats) -> Array:
     """A point (3,) of a body's frame, in the world. pose (7,), point (3,) -> (3,)."""
     return pose[:3] + rotations.quaternion_rotate(pose[3:], jnp.asarray(point, jnp.float32))
 
@@ -339,7 +361,9 @@ def point_in_body(pose: Array, point: Array) -> Array:
     return rotations.quaternion_rotate(rotations.quaternion_conjugate(pose[3:]), point - pose[:3])
 
 
-def key_poses(positions: Any, grippers: list[float], quaternion: Any = rotations.DOWN) -> Action:
+def keyframes(
+    positions: Iterable[ArrayLike], grippers: Sequence[float], quaternion: ArrayLike | Floats = rotations.DOWN
+) -> Action:
     """The keyframes of one arm: M positions (3,) -> Action (M, 1, ...). quaternion: (4,), or (M, 4) of each."""
     points = jnp.stack([jnp.asarray(position, jnp.float32) for position in positions])
     turns = jnp.broadcast_to(jnp.asarray(quaternion, jnp.float32), (len(points), 4))

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import FIXTURE, VISUAL
 from dsvla_jax.sim.tasks import task
@@ -18,7 +19,7 @@ OPEN_ANGLE, CLOSED_BY = 1.8, 1.7  # radians: how far the seat is raised, and how
 RADIUS, CLEARANCE, ABOVE, PAD, PUSHED_ANGLE, PRESS = 0.15, 0.04, 0.1, 0.012, 1.0, 0.01
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     root = task.add_furniture(spec, "toilet")
     white, shade, water, blue = [0.95, 0.95, 0.96, 1], [0.85, 0.86, 0.88, 1], [0.45, 0.65, 0.8, 1], [0.2, 0.4, 0.7, 1]
     task.add_part(root, "toilet_foot", task.BOX, [0.085, 0.05, 0.05], [0.03, 0, 0.05], shade)
@@ -78,7 +79,7 @@ def _expert(view: task.StateView) -> Action:
     above = behind + jnp.array([0.0, 0.0, ABOVE])
     pushed = _on_seat(view, PUSHED_ANGLE, RADIUS, TUBE + PAD)
     pressed = _on_seat(view, 0.0, SEAT, TUBE - PRESS)
-    return task.key_poses([above, behind, pushed, pressed], [task.CLOSED] * 4)
+    return task.keyframes([above, behind, pushed, pressed], [task.CLOSED] * 4)
 
 
 TASK = task.Task(

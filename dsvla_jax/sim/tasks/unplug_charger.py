@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from dsvla_jax.sim.robot import FIXTURE, OBJECT
 from dsvla_jax.sim.tasks import task
@@ -18,7 +19,7 @@ OUT = 0.05  # how far the charger must be pulled
 APPROACH, PULL = 0.08, 0.117  # metres over the charger, and out of the socket
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     board = task.add_furniture(spec, "charger_board")
     cream, white, black, metal = (
         [0.85, 0.8, 0.68, 1],
@@ -77,7 +78,7 @@ def _expert(view: task.StateView) -> Action:
     charger = view.body_pose("charger")
     offsets = ((0.0, 0.0, APPROACH), (0.0, 0.0, 0.0), (PULL, 0.0, 0.0))
     positions = [task.point_in_world(charger, offset) for offset in offsets]
-    return task.key_poses(positions, [task.OPEN, task.CLOSED, task.CLOSED], task.pointing_down(task.yaw_of(charger)))
+    return task.keyframes(positions, [task.OPEN, task.CLOSED, task.CLOSED], task.pointing_down(task.yaw_of(charger)))
 
 
 TASK = task.Task(

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from dsvla_jax.geometry import rotations
@@ -27,7 +28,7 @@ NEAR, LIFTED = 0.12, 0.04  # before that, the head has come so near to the pot's
 APPROACH, LIFT, POUR_HEIGHT, TILTS = 0.1, 0.14, 0.21, np.deg2rad((35.0, 43.0, 50.0))
 
 
-def _build(spec) -> None:
+def _build(spec: mujoco.MjSpec) -> None:
     plant = task.add_furniture(spec, "plant")
     clay, earth, green = [0.75, 0.36, 0.2, 1], [0.2, 0.12, 0.07, 1], [0.15, 0.55, 0.15, 1]
     task.add_part(plant, "plant_pot", task.CYLINDER, [POT, 0.034], [0, 0, 0.034], clay)
@@ -127,7 +128,7 @@ def _expert(view: task.StateView) -> Action:
         turn = rotations.quaternion_multiply(can[3:], lean)
         positions.append(head_goal - rotations.quaternion_rotate(turn, jnp.asarray(offset)))
         turns.append(rotations.quaternion_multiply(turn, rotations.DOWN))
-    return task.key_poses(positions, [task.OPEN] + [task.CLOSED] * 5, jnp.stack(turns))
+    return task.keyframes(positions, [task.OPEN] + [task.CLOSED] * 5, jnp.stack(turns))
 
 
 TASK = task.Task(
