@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from data_pipelines.oxe.fixtures import write_fixtures
+from data_pipelines.oxe.fixtures.write import write_fixtures
 from data_pipelines.oxe.mixture import MixtureSource, describe_dataset
 from data_pipelines.oxe.registry import DATASETS, MIXTURES, get_dataset
 from data_pipelines.oxe.scale import MixtureScale

@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from data_pipelines.oxe.motion import Arm, Column, Motion, require_finite
+from data_pipelines.oxe.columns import Column, require_finite
+from data_pipelines.oxe.motion import Motion
 from data_pipelines.rlds.features import RldsEpisode
 from dsvla_jax.errors import DataError
 from dsvla_jax.observation_checks import has_words
@@ -46,6 +47,21 @@ class Depth:
 
 
 @dataclasses.dataclass(frozen=True)
+class ArmColumns:
+    """Where one arm's motion stands in an episode.
+
+    pose: (T, 7). action: (T, 6). gripper: (T,), commanded openness. gripper_state: (T,), measured openness.
+    joints: (T, J).
+    """
+
+    gripper: Column
+    pose: Column | None = None
+    action: Column | None = None
+    gripper_state: Column | None = None
+    joints: Column | None = None
+
+
+@dataclasses.dataclass(frozen=True)
 class OxeDataset:
     """How one dataset tells its robot's motion.
 
@@ -61,7 +77,7 @@ class OxeDataset:
     hz: float
     source: str
     images: dict[View, str]
-    arms: tuple[Arm, ...]
+    arms: tuple[ArmColumns, ...]
     language: str = "language_instruction"
     code_points: bool = False
     bgr: tuple[View, ...] = ()
