@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.codec import PoseCodec

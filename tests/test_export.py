@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from tokenizers import Tokenizer
 
 import dsvla_jax.weights.__main__ as program
-from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import (
     LanguageConfig,

@@ -11,7 +11,7 @@ import pytest
 
 import train
 from data_pipelines.samples import suite_tokenizer
-from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.layers import REMAT_POLICIES

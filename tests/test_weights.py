@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, RopeScaling, VisionConfig
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs

@@ -27,9 +27,8 @@ from data_pipelines.recording import make_demonstration
 from data_pipelines.records import Episode
 from data_pipelines.rlbench.files import find_episodes, left_aside, read_recording
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
-from dsvla_jax.digests import file_digest
 from dsvla_jax.errors import DataError
-from dsvla_jax.files import hold_folder
+from dsvla_jax.files import file_digest, hold_folder
 from dsvla_jax.ranges import Range, at_least, check_fields, require
 
 EPISODES_PER_SHARD = 20

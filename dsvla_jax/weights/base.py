@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 
-from dsvla_jax.checkpoints import CheckpointError, require_same_shapes
+from dsvla_jax.checkpoints.storage import CheckpointError, require_same_shapes
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.quantize import SCALE, TOWERS, is_quantized, quantize_kernel

@@ -22,7 +22,9 @@ from flax import traverse_util
 from safetensors.numpy import save_file
 from tqdm import tqdm
 
-from dsvla_jax.checkpoints import RunCheckpoints, StoredVariable, require_same_shapes
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.storage import require_same_shapes
+from dsvla_jax.checkpoints.variables import StoredVariable
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig

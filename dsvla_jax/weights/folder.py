@@ -6,7 +6,6 @@ params/             an orbax checkpoint of a PyTree, its arrays in zarr chunks
 
 import contextlib
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,8 @@ import tensorstore as ts
 from flax import traverse_util
 from jax.sharding import SingleDeviceSharding
 
-from dsvla_jax.checkpoints import SEPARATOR, CheckpointError, require_same_shapes, require_writable_path
+from dsvla_jax.checkpoints.storage import SEPARATOR, CheckpointError, require_same_shapes, require_writable_path
+from dsvla_jax.files import whole_folder
 
 DESCRIPTION, PARAMS = "description.json", "params"
 # Numbers along each of a chunk's two sides, 8 MB of bfloat16. Whoever needs a part of a chunk reads all of it.
@@ -33,15 +33,8 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """
     if folder.exists():
         raise CheckpointError(f"{folder} exists already; remove it, or choose another folder")
-    partial = folder.absolute().with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
-    try:
-        partial.mkdir(parents=True)
+    with whole_folder(folder) as partial:
         yield partial
-        partial.rename(folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
 
 
 @contextlib.contextmanager

@@ -3,9 +3,10 @@
 Orbax restores arrays with flipped bits without a word, and the errors of a truncated file are TensorStore's.
 """
 
-import hashlib
 import json
 from pathlib import Path
+
+from dsvla_jax.files import file_digest
 
 FILE = "digests.json"
 
@@ -34,9 +35,3 @@ def damage(folder: Path) -> str | None:
         if file_digest(path) != digest:
             return f"{name} is not what was written (sha256 differs)"
     return None
-
-
-def file_digest(path: Path) -> str:
-    """sha256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
