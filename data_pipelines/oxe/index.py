@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import sys
-import uuid
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.displacement import is_constant
 from dsvla_jax.encoding.text import split_words
 from dsvla_jax.errors import DataError
+from dsvla_jax.files import replacing
 from dsvla_jax.observation_checks import check_camera, check_in_view, check_poses
 
 VERSION = 4
@@ -111,10 +111,8 @@ def _keep(index: Index, path: Path | None) -> None:
     try:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Not the process's number: it is the same in two containers that share a disk.
-            temporary = path.with_suffix(f".{uuid.uuid4().hex}.partial")
-            temporary.write_text(json.dumps(_pack(index)) + "\n")
-            os.replace(temporary, path)
+            with replacing(path, shared=True) as partial:
+                partial.write_text(json.dumps(_pack(index)) + "\n")
             return
     except OSError as error:
         problem = f"{path}: {error.strerror}"

@@ -9,6 +9,7 @@ from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import replacing
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.ranges import at_least, check_fields, more_than, require
@@ -181,9 +182,8 @@ def _differences(one: Any, other: Any) -> list[str]:
 
 def save_experiment(path: Path, experiment: Experiment) -> None:
     """Writes the experiment as JSON: whole, or not at all."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(dataclasses.asdict(experiment), indent=2) + "\n")
-    partial.replace(path)
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(dataclasses.asdict(experiment), indent=2) + "\n")
 
 
 def load_experiment(path: Path) -> Experiment:
