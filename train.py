@@ -62,7 +62,7 @@ from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_ba
 from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
-from dsvla_jax.weights.base import is_imported, load_for_model, require_base
+from dsvla_jax.weights.backbones import is_imported, load_for_model, require_base
 
 
 def prepare(

@@ -26,7 +26,7 @@ from dsvla_jax.model.config import (
 )
 from dsvla_jax.model.lora import merge_lora, unmerge_lora
 from dsvla_jax.weights.export import ExportOptions, export_run
-from dsvla_jax.weights.sources import read_language, read_vision
+from dsvla_jax.weights.readers.any_format import read_language, read_vision
 from tests.run_folders import TOKENIZER, write_run
 
 LORA = LoraConfig(rank=3, alpha=7.0)

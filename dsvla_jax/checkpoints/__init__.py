@@ -11,5 +11,5 @@ A run folder holds
 
 `run` saves and restores a run's steps, `base` its frozen variables. `digests` and `steps` find those that are whole,
 `retention` says which ones stay, and `storage` is what all of them ask of orbax. Weights imported from elsewhere are a
-folder of their own (`dsvla_jax.weights.folder`).
+folder of their own (`dsvla_jax.weights.imported_folder`).
 """

@@ -5,7 +5,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import orbax.checkpoint as ocp
@@ -28,6 +28,7 @@ from dsvla_jax.checkpoints.storage import (
     tree_of,
 )
 from dsvla_jax.checkpoints.variables import StoredVariable, stored_variables
+from dsvla_jax.json_values import Json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,8 +49,8 @@ class Arrays:
 class Notes:
     """What a step keeps as JSON. iterator: the position in the data. config: the experiment."""
 
-    iterator: dict[str, Any]
-    config: dict[str, Any]
+    iterator: dict[str, Json]
+    config: dict[str, Json]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +76,7 @@ class RunCheckpoints:
     whole one takes its place. Raises CheckpointError for a path that nothing can be stored at.
     """
 
-    def __init__(self, run: Path, *, keep: int = 2, read_only: bool = False):
+    def __init__(self, run: Path, *, keep: int = 2, read_only: bool = False) -> None:
         require_writable_path(run, SEPARATOR if read_only else PATTERN_CHARACTERS + SEPARATOR)
         self.folder = run.absolute() / "checkpoints"
         self._base = run.absolute() / "base"

@@ -9,8 +9,8 @@ from flax import traverse_util
 
 from dsvla_jax.errors import UserError
 
-PyTree = Any
-"""Nested containers of arrays, or of what has their shapes. Python has no type for it."""
+PyTree = Any  # no type of Python describes it
+"""Nested containers of arrays, or of what has their shapes."""
 ARRAY_INDEX = "manifest.ocdbt"
 
 # Orbax looks for what it wrote with a pattern that begins with the folder's own path; TensorStore takes a backslash for

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from dsvla_jax.model.llama import rotary_frequencies
-from dsvla_jax.weights.configs import read_language_config, read_vision_config
-from dsvla_jax.weights.safetensors import list_tensors
-from dsvla_jax.weights.tensors import WeightsError
+from dsvla_jax.weights.readers.hugging_face_config import read_language_config, read_vision_config
+from dsvla_jax.weights.readers.safetensors import list_tensors
+from dsvla_jax.weights.stored_tensors import WeightsError
 from dsvla_jax.weights.towers import Tower, assign, find_prefix, summarize, tower_shapes
 
 _LLAMA_LINEAR = {

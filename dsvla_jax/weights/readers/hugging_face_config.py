@@ -7,12 +7,12 @@ import dataclasses
 import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 from dsvla_jax.encoding.encode import CLIP_MEAN, CLIP_STD
+from dsvla_jax.json_values import Json
 from dsvla_jax.model.config import LanguageConfig, RopeScaling, VisionConfig
-from dsvla_jax.weights.safetensors import read_json
-from dsvla_jax.weights.tensors import WeightsError
+from dsvla_jax.weights.readers.safetensors import read_json
+from dsvla_jax.weights.stored_tensors import WeightsError
 
 CONFIG = "config.json"
 # How pictures were prepared: a file, and the field in it, or none.
@@ -67,7 +67,7 @@ class Section:
     """The part of a config.json that describes one tower."""
 
     file: Path
-    values: Mapping[str, Any]
+    values: Mapping[str, Json]
 
     def number(self, name: str, default: float) -> float:
         """A numeric field; absent and null mean the default."""
@@ -99,13 +99,13 @@ class Section:
             raise WeightsError(f"{self.file}: {name}: expected true or false, found {value!r}")
         return bool(value)
 
-    def require(self, name: str, supported: Any) -> None:
+    def require(self, name: str, supported: Json) -> None:
         """Refuses a variant of the architecture that this project does not compute; absent and null mean none."""
         value = self.values.get(name)
         if value not in (None, supported):
             raise WeightsError(f"{self.file}: {name}: only {supported!r} is supported, found {value!r}")
 
-    def require_all(self, neutral: Mapping[str, Any]) -> None:
+    def require_all(self, neutral: Mapping[str, Json]) -> None:
         """Refuses every field that has another value than the one with which it changes nothing."""
         for name, value in neutral.items():
             self.require(name, value)
@@ -257,5 +257,5 @@ def _require_normalisation(folder: Path) -> None:
                 )
 
 
-def _rounded(number: Any) -> Any:
+def _rounded(number: Json) -> Json:
     return round(number, 4) if isinstance(number, float) else number

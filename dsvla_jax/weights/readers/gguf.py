@@ -5,13 +5,13 @@ ggml-org/ggml, docs/gguf.md (keys of the metadata); ggml-org/llama.cpp, gguf-py.
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
 from dsvla_jax.model.config import LanguageConfig
-from dsvla_jax.weights.configs import Section
-from dsvla_jax.weights.tensors import AGAIN, StoredTensor, WeightsError
+from dsvla_jax.weights.readers.hugging_face_config import Section
+from dsvla_jax.weights.stored_tensors import AGAIN, StoredTensor, WeightsError
 from dsvla_jax.weights.towers import Tower, assign, tower_shapes
 
 _LINEAR = {
@@ -44,6 +44,7 @@ class QuantizedTensor(StoredTensor):
     """A tensor in one of GGML's formats: blocks of numbers along the last axis. dtype: the format's name."""
 
     def check(self) -> None:
+        """Raises WeightsError if the format is not read, or the blocks do not fill their bytes."""
         quants = _package().quants
         kind = _package().GGMLQuantizationType[self.dtype]
         try:
@@ -58,7 +59,7 @@ class QuantizedTensor(StoredTensor):
         return _package().quants.dequantize(content, _package().GGMLQuantizationType[self.dtype])
 
 
-def _package() -> Any:
+def _package() -> ModuleType:
     try:
         import gguf  # pyright: ignore[reportMissingImports]
     except ImportError as error:

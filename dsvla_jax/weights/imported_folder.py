@@ -8,7 +8,6 @@ import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -17,8 +16,9 @@ import tensorstore as ts
 from flax import traverse_util
 from jax.sharding import SingleDeviceSharding
 
-from dsvla_jax.checkpoints.storage import SEPARATOR, CheckpointError, require_same_shapes, require_writable_path
+from dsvla_jax.checkpoints.storage import SEPARATOR, CheckpointError, PyTree, require_same_shapes, require_writable_path
 from dsvla_jax.files import whole_folder
+from dsvla_jax.json_values import Json
 
 DESCRIPTION, PARAMS = "description.json", "params"
 # Numbers along each of a chunk's two sides, 8 MB of bfloat16. Whoever needs a part of a chunk reads all of it.
@@ -39,8 +39,8 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def create_weights(
-    folder: Path, leaves: Mapping[str, jax.ShapeDtypeStruct], description: dict[str, Any]
-) -> Iterator[dict[str, Any]]:
+    folder: Path, leaves: Mapping[str, jax.ShapeDtypeStruct], description: Mapping[str, Json]
+) -> Iterator[dict[str, ts.TensorStore]]:
     """A new folder of weights, see `new_folder`.
 
     leaves: by path ("language/layers/q/kernel"). Yields an array on disk for each: ``arrays[path][index] = values``
@@ -60,18 +60,18 @@ def create_weights(
         (partial / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
 
 
-def _create_array(folder: Path, path: str, leaf: jax.ShapeDtypeStruct) -> Any:
+def _create_array(folder: Path, path: str, leaf: jax.ShapeDtypeStruct) -> ts.TensorStore:
     chunks = [1] * (leaf.ndim - 2) + [min(size, CHUNK) for size in leaf.shape[-2:]]
     metadata = {"chunks": chunks, "compressor": {"id": "zstd", "level": 1}}
     spec = _spec(folder / PARAMS / path.replace("/", ".")) | {"metadata": metadata}
     return ts.open(spec, create=True, delete_existing=True, shape=leaf.shape, dtype=ts.dtype(leaf.dtype)).result()
 
 
-def _spec(array: Path) -> dict[str, Any]:
+def _spec(array: Path) -> dict[str, Json]:
     return {"driver": "zarr", "kvstore": {"driver": "file", "path": f"{array.absolute()}/"}}
 
 
-def describe_weights(folder: Path) -> dict[str, Any]:
+def describe_weights(folder: Path) -> dict[str, Json]:
     """The description of a folder that `create_weights` made. Raises CheckpointError where it made none here."""
     file = folder / DESCRIPTION
     if not file.is_file():
@@ -88,7 +88,9 @@ def _keep(path: str, array: jax.Array) -> dict[str, jax.Array]:
     return {path: array}
 
 
-def restore_weights(folder: Path, like: Any, convert: Callable[[str, jax.Array], dict[str, jax.Array]] = _keep) -> Any:
+def restore_weights(
+    folder: Path, like: PyTree, convert: Callable[[str, jax.Array], dict[str, jax.Array]] = _keep
+) -> PyTree:
     """The parameters of a folder, with the structure, shapes, dtypes and shardings of ``like``.
 
     A device is given its shard and no more. A host reads the chunks of its own devices' shards, an array at a time.
@@ -100,13 +102,13 @@ def restore_weights(folder: Path, like: Any, convert: Callable[[str, jax.Array],
     }
     require_same_shapes(traverse_util.unflatten_dict(stored, sep="."), like, folder)
     restored: dict[str, jax.Array] = {}
-    leaves: dict[str, Any] = traverse_util.flatten_dict(like, sep="/")
+    leaves: dict[str, jax.ShapeDtypeStruct] = traverse_util.flatten_dict(like, sep="/")
     for path, leaf in leaves.items():
         restored |= convert(path, _restore_array(stored[path.replace("/", ".")], leaf))
     return traverse_util.unflatten_dict(restored, sep="/")
 
 
-def _restore_array(store: Any, like: jax.ShapeDtypeStruct) -> jax.Array:
+def _restore_array(store: ts.TensorStore, like: jax.ShapeDtypeStruct) -> jax.Array:
     sharding = like.sharding or SingleDeviceSharding(jax.devices()[0])
     values = ts.cast(store, ts.dtype(like.dtype))
     return jax.make_array_from_callback(like.shape, sharding, lambda index: values[index].read().result())

@@ -3,24 +3,24 @@
 import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cattrs
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
+from numpy.typing import DTypeLike
 
-from dsvla_jax.checkpoints.storage import CheckpointError, require_same_shapes
+from dsvla_jax.checkpoints.storage import CheckpointError, PyTree, require_same_shapes
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.quantize import SCALE, TOWERS, is_quantized, quantize_kernel
 from dsvla_jax.model.variables import MATRICES
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import load_policy_config
-from dsvla_jax.weights.folder import DESCRIPTION, create_weights, describe_weights, restore_weights
-from dsvla_jax.weights.llama_adapter import read_adapter
-from dsvla_jax.weights.sources import read_language, read_vision
-from dsvla_jax.weights.tensors import WeightsError
+from dsvla_jax.weights.imported_folder import DESCRIPTION, create_weights, describe_weights, restore_weights
+from dsvla_jax.weights.readers.any_format import read_language, read_vision
+from dsvla_jax.weights.readers.llama_adapter import read_adapter
+from dsvla_jax.weights.stored_tensors import WeightsError
 from dsvla_jax.weights.towers import Tower
 
 # Where each tower's parameters are among a model's variables.
@@ -56,7 +56,7 @@ def import_backbones(
     out: Path,
     vision_source: Path | None = None,
     image_size: int | None = None,
-    dtype: Any = np.float32,
+    dtype: DTypeLike = np.float32,
     projection: bool = False,
     adapter: Path | None = None,
     adapter_heads: int = VisualPromptConfig().heads,
@@ -115,7 +115,7 @@ def present_towers(towers: Towers) -> list[str]:
     return [name for name in ("language", "vision", "projector") if getattr(towers, name) is not None]
 
 
-def backbone_shapes(folder: Path) -> dict[str, Any]:
+def backbone_shapes(folder: Path) -> dict[str, PyTree]:
     """The variables in a folder, {"params": by tower, and "lora" if there are any}, as float32 ShapeDtypeStructs."""
     towers = read_towers(folder)
     config = ModelConfig(
@@ -130,7 +130,7 @@ def backbone_shapes(folder: Path) -> dict[str, Any]:
     return shapes if towers.lora is None else {**shapes, "lora": variables["lora"]}
 
 
-def load_backbones(folder: Path, like: Any = None) -> dict[str, Any]:
+def load_backbones(folder: Path, like: PyTree = None) -> dict[str, PyTree]:
     """The variables in a folder: they replace those of a model of `read_towers`' sizes.
 
     like: what `backbone_shapes` gives, with the dtypes and shardings that are wanted; None for float32 on one device.
@@ -164,7 +164,7 @@ def require_base(folder: Path, model: ModelConfig) -> None:
     require_same_shapes(found, expected, folder)
 
 
-def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -> dict[str, Any]:
+def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -> dict[str, PyTree]:
     """The variables in a folder for a model of these sizes, split over the mesh.
 
     frozen: whether the towers will not learn, so that their matrices have the dtype of a frozen base.
@@ -174,12 +174,14 @@ def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -
     towers = require_same_model(folder, model)
     full = dataclasses.replace(model, base_dtype="same")
     variables = jax.eval_shape(lambda: initialize(full, jax.random.key(0)))
-    like: dict[str, Any] = {"params": {name: variables["params"][name] for name in present_towers(towers)}}
+    like: dict[str, PyTree] = {"params": {name: variables["params"][name] for name in present_towers(towers)}}
     if towers.lora is not None:
         like["lora"] = {"language": variables["lora"]["language"]}
     where = shardings(like, mesh)
 
-    def placed(path: Any, leaf: Any, sharding: NamedSharding) -> jax.ShapeDtypeStruct:
+    def placed(
+        path: tuple[jax.tree_util.DictKey, ...], leaf: jax.ShapeDtypeStruct, sharding: NamedSharding
+    ) -> jax.ShapeDtypeStruct:
         keys = [key.key for key in path]
         narrow = keys[1] in TOWERS and keys[0] == "params" and keys[-1] in MATRICES
         dtype = model.frozen_dtype if narrow and frozen else leaf.dtype

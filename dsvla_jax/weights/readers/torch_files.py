@@ -16,9 +16,9 @@ import pickle
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO
 
-from dsvla_jax.weights.tensors import AGAIN, FLOATS, StoredTensor, WeightsError
+from dsvla_jax.weights.stored_tensors import AGAIN, FLOATS, StoredTensor, WeightsError
 
 DTYPES = {"FloatStorage": "F32", "HalfStorage": "F16", "BFloat16Storage": "BF16"}
 # What training scripts save beside the parameters. Nothing of it is kept.
@@ -39,31 +39,31 @@ SAVE_AGAIN = "save it again with a newer PyTorch: torch.save(torch.load(file, we
 class _Ignored:
     """Stands for an object of any class: keeps its attributes and items, does nothing."""
 
-    def __init__(self, *_: Any, **__: Any):
+    def __init__(self, *_: object, **__: object) -> None:
         pass
 
-    def __setstate__(self, state: Any) -> None:
+    def __setstate__(self, state: object) -> None:
         if isinstance(state, Mapping):
             self.__dict__.update(state)
 
-    def append(self, _: Any) -> None:
+    def append(self, _: object) -> None:
         pass
 
-    def extend(self, _: Any) -> None:
+    def extend(self, _: object) -> None:
         pass
 
-    def __setitem__(self, _: Any, __: Any) -> None:
+    def __setitem__(self, _: object, __: object) -> None:
         pass
 
 
 class _Unpickler(pickle.Unpickler):
     """Rebuilds dicts and lists, and a StoredTensor in place of each tensor."""
 
-    def __init__(self, stream: Any, file: Path, storages: Mapping[str, tuple[int, int]]):
+    def __init__(self, stream: IO[bytes], file: Path, storages: Mapping[str, tuple[int, int]]) -> None:
         super().__init__(stream)
         self._file, self._storages = file, storages
 
-    def find_class(self, module: str, name: str) -> Any:
+    def find_class(self, module: str, name: str) -> object:
         if module == "collections" and name == "OrderedDict":
             return collections.OrderedDict
         if module == "torch._utils" and name == "_rebuild_tensor_v2":
@@ -79,12 +79,12 @@ class _Unpickler(pickle.Unpickler):
             "get the file from a source that you trust"
         )
 
-    def persistent_load(self, pid: Any) -> tuple[str, str]:
+    def persistent_load(self, pid: tuple[object, ...]) -> tuple[str, str]:
         _, kind, key, *_ = pid
         return str(kind), str(key)
 
     def _tensor(
-        self, storage: tuple[str, str], offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any
+        self, storage: tuple[str, str], offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: object
     ) -> StoredTensor:
         kind, key = storage
         dtype = DTYPES.get(kind, kind)
@@ -155,7 +155,7 @@ def _storages(file: Path, archive: zipfile.ZipFile, prefix: str) -> dict[str, tu
     return places
 
 
-def _collect(value: Any, path: tuple[str, ...], tensors: dict[str, StoredTensor]) -> None:
+def _collect(value: object, path: tuple[str, ...], tensors: dict[str, StoredTensor]) -> None:
     if isinstance(value, StoredTensor):
         key = ".".join(path)
         tensors[key] = dataclasses.replace(value, key=key)

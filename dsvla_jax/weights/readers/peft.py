@@ -5,8 +5,8 @@ Files and names: huggingface/peft, "PEFT checkpoint format" in its documentation
 
 from pathlib import Path
 
-from dsvla_jax.weights.safetensors import read_json
-from dsvla_jax.weights.tensors import WeightsError
+from dsvla_jax.weights.readers.safetensors import read_json
+from dsvla_jax.weights.stored_tensors import WeightsError
 
 CONFIG = "adapter_config.json"
 FILES = ("adapter_model.safetensors", "adapter_model.bin")

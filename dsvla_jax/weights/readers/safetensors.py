@@ -8,14 +8,14 @@ https://github.com/huggingface/safetensors (README, "Format").
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from dsvla_jax.weights.tensors import AGAIN, StoredTensor, WeightsError
+from dsvla_jax.json_values import Json
+from dsvla_jax.weights.stored_tensors import AGAIN, StoredTensor, WeightsError
 
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
 
 
-def read_json(file: Path) -> dict[str, Any]:
+def read_json(file: Path) -> dict[str, Json]:
     """A JSON object. Raises WeightsError naming the file where it is missing or something else."""
     if file.parent.is_file():
         raise WeightsError(f"{file.parent}: a file; expected the folder of a Hugging Face checkpoint, which it lies in")

@@ -7,7 +7,6 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from safetensors.numpy import save_file
@@ -16,11 +15,12 @@ from tokenizers import Tokenizer as FastTokenizer
 
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer
 from dsvla_jax.errors import UserError
+from dsvla_jax.json_values import Json
 from dsvla_jax.model.config import LanguageConfig, VisionConfig
-from dsvla_jax.weights.safetensors import INDEX, SINGLE
+from dsvla_jax.weights.readers.safetensors import INDEX, SINGLE
 
 
-def language_json(config: LanguageConfig, dtype: str) -> dict[str, Any]:
+def language_json(config: LanguageConfig, dtype: str) -> dict[str, Json]:
     """The config.json of a LlamaForCausalLM, without the ids of special tokens.
 
     Raises UserError where some but not all layers of the attention, or of the MLP, have biases: it has no such model.
@@ -63,7 +63,7 @@ def language_json(config: LanguageConfig, dtype: str) -> dict[str, Any]:
     return fields
 
 
-def vision_json(config: VisionConfig, dtype: str) -> dict[str, Any]:
+def vision_json(config: VisionConfig, dtype: str) -> dict[str, Json]:
     """The config.json of a CLIPVisionModel; with CLIP's projection, of a CLIPVisionModelWithProjection."""
     projected = config.embed_width is not None
     fields = {
@@ -83,7 +83,7 @@ def vision_json(config: VisionConfig, dtype: str) -> dict[str, Any]:
     return fields | ({"projection_dim": config.embed_width} if projected else {})
 
 
-def write_json(file: Path, content: Mapping[str, Any]) -> None:
+def write_json(file: Path, content: Mapping[str, Json]) -> None:
     """Writes an object as JSON."""
     file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 

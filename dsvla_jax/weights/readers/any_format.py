@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from dsvla_jax.weights import from_hugging_face, gguf, original
-from dsvla_jax.weights.peft_adapters import refuse_peft_adapter
+from dsvla_jax.weights.readers import gguf, hugging_face, llama_consolidated, openai_clip
+from dsvla_jax.weights.readers.peft import refuse_peft_adapter
 from dsvla_jax.weights.towers import Tower, resample
 
 
@@ -15,9 +15,9 @@ def read_language(source: Path) -> Tower:
     refuse_peft_adapter(source)
     if source.suffix == ".gguf":
         return gguf.read_language(source)
-    if (source / original.PARAMS).is_file():
-        return original.read_meta_language(source)
-    return from_hugging_face.read_language(source)
+    if (source / llama_consolidated.PARAMS).is_file():
+        return llama_consolidated.read_language(source)
+    return hugging_face.read_language(source)
 
 
 def read_vision(source: Path, image_size: int | None = None, projection: bool = False) -> Tower:
@@ -27,6 +27,6 @@ def read_vision(source: Path, image_size: int | None = None, projection: bool = 
     projection: read the projection into CLIP's joint embedding too. Raises WeightsError as `read_language` does.
     """
     refuse_peft_adapter(source)
-    read = original.read_openai_vision if source.is_file() else from_hugging_face.read_vision
+    read = openai_clip.read_vision if source.is_file() else hugging_face.read_vision
     tower = read(source, projection)
     return tower if image_size in (None, tower.config.image_size) else resample(tower, image_size, source)

@@ -8,10 +8,10 @@ import dataclasses
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 
+from dsvla_jax.checkpoints.storage import PyTree
 from dsvla_jax.model.config import (
     LORA_TARGETS,
     LanguageConfig,
@@ -21,17 +21,11 @@ from dsvla_jax.model.config import (
     VisualPromptConfig,
 )
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.weights.original import (
-    CLIP_NAMES,
-    META_BLOCKS,
-    META_LINEAR,
-    META_NAMES,
-    in_rotary_pairs,
-    split_in_projections,
-)
-from dsvla_jax.weights.peft_adapters import refuse_peft_adapter
-from dsvla_jax.weights.tensors import StoredTensor, WeightsError
-from dsvla_jax.weights.torch_files import list_tensors
+from dsvla_jax.weights.readers.llama_consolidated import META_BLOCKS, META_LINEAR, META_NAMES, in_rotary_pairs
+from dsvla_jax.weights.readers.openai_clip import CLIP_NAMES, split_in_projections
+from dsvla_jax.weights.readers.peft import refuse_peft_adapter
+from dsvla_jax.weights.readers.torch_files import list_tensors
+from dsvla_jax.weights.stored_tensors import StoredTensor, WeightsError
 from dsvla_jax.weights.towers import Place, Tower, assign, find_places, find_prefix, flat_shapes, tower_shapes
 
 PROJECTOR_NAMES = {
@@ -200,5 +194,5 @@ def _projector(
     return assign(prompt, shapes, PROJECTOR_NAMES, tensors, file)
 
 
-def _variables(config: ModelConfig) -> dict[str, Any]:
+def _variables(config: ModelConfig) -> dict[str, PyTree]:
     return jax.eval_shape(lambda: initialize(config, jax.random.key(0)))
