@@ -21,13 +21,17 @@ class OptimizerConfig:
     """AdamW with linear warm-up and a cosine to `final_fraction` of the peak."""
 
     learning_rate: float = 1e-3
-    """Of the peak."""
+    """Peak learning rate."""
     warmup_steps: int = 50
     """Steps of linear warm-up, but at most a fifth of the run."""
     final_fraction: float = 0.0
+    """Learning rate at the end of the cosine, as a fraction of the peak."""
     weight_decay: float = 0.05
+    """AdamW's decoupled weight decay, on kernels only."""
     beta1: float = 0.9
+    """Decay of Adam's mean of the gradient."""
     beta2: float = 0.95
+    """Decay of Adam's mean of the squared gradient."""
     gradient_clip: float = 1.0
     """Largest norm of the gradient; inf for no limit."""
 
@@ -76,13 +80,19 @@ class Experiment:
     """Everything that decides the outcome of a run."""
 
     encoding: EncodingConfig
+    """How an observation and a text become the network's inputs, and its answer an action."""
     model: ModelConfig
+    """Sizes and switches of the network."""
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    """Simulated, imported or own demonstrations."""
     oxe: OxeConfig | None = None
     """Open X-Embodiment episodes to learn from instead of `data`."""
     optimizer: OptimizerConfig = OptimizerConfig()
+    """AdamW and its schedule."""
     validation: ValidationConfig = ValidationConfig()
+    """Comparison with held-out demonstrations."""
     evaluation: EvaluationConfig = EvaluationConfig()
+    """Closed-loop episodes."""
     regime: Literal["full", "lora", "adapters"] = "full"
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
     base: str = ""
@@ -91,6 +101,7 @@ class Experiment:
     tokenizer: str = ""
     """A folder with the language model's vocabulary; empty: the words of the task suite."""
     steps: int = 1000
+    """Training steps."""
     batch_size: int = 32
     """Examples a step, over all devices."""
     gradient_accumulation: int = 1
@@ -103,6 +114,7 @@ class Experiment:
     soft_target_sigma: float = 0.0
     """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0
+    """Seed of the initial parameters, the order of the data and all noise."""
     log_every: int = 20
     """Steps after which the numbers of a step are written, and at the end; 0 for the end alone."""
     validate_every: int = 0

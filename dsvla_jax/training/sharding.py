@@ -16,15 +16,18 @@ from dsvla_jax.ranges import at_least, check_fields
 
 @dataclasses.dataclass(frozen=True)
 class MeshConfig:
-    """How many devices stand along each axis of the mesh; -1, for one axis, is all that the others leave.
+    """How many devices lie along each axis of the mesh. The default suits models that fit one device.
 
-    data: the batch is split, parameters are copied. fsdp: the batch is split, and parameters and optimizer state too.
-    tensor: the hidden width of each layer is split; keep it within a host. The default suits models that fit a device.
+    One axis may be -1: it takes the devices that the others leave.
     """
 
     data: int = -1
+    """Devices that split the batch and hold whole copies of the parameters; -1 for all that the other axes leave."""
     fsdp: int = 1
+    """Devices that split the batch, the parameters and the optimizer state; -1 for all that the other axes leave."""
     tensor: int = 1
+    """Devices that split the hidden width of each layer; keep them within one host. -1 for all that the other axes
+    leave."""
 
     def __post_init__(self) -> None:
         sizes = {axis: getattr(self, axis) for axis in MESH_AXES}
