@@ -7,8 +7,9 @@ python -m data_pipelines.oxe fixtures data/oxe_fixtures --datasets bridge_datase
 """
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -103,7 +104,12 @@ def fixtures(
 
 if __name__ == "__main__":
     with fail_with_message():
-        commands: dict[str, Any] = {"list": list_, "prepare": prepare, "vocabulary": vocabulary, "fixtures": fixtures}
+        commands: dict[str, Callable[..., None]] = {
+            "list": list_,
+            "prepare": prepare,
+            "vocabulary": vocabulary,
+            "fixtures": fixtures,
+        }
         if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
             print(__doc__)
             sys.exit(0 if len(sys.argv) > 1 else 2)

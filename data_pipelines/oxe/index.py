@@ -29,6 +29,7 @@ from dsvla_jax.encoding.displacement import is_constant
 from dsvla_jax.encoding.text import split_words
 from dsvla_jax.errors import DataError
 from dsvla_jax.files import replacing
+from dsvla_jax.json_values import Json
 from dsvla_jax.observation_checks import check_camera, check_in_view, check_poses
 
 VERSION = 4
@@ -68,6 +69,7 @@ class Index:
 
     @property
     def num_samples(self) -> int:
+        """Of all usable episodes."""
         return int(self.samples.sum())
 
     @property
@@ -285,8 +287,8 @@ def _report_other_versions(path: Path, dataset: OxeDataset, config: OxeConfig) -
         )
 
 
-def _pack(index: Index) -> dict[str, Any]:
-    def plain(value: Any) -> Any:
+def _pack(index: Index) -> dict[str, Json]:
+    def plain(value: object) -> Json:
         if isinstance(value, np.ndarray):
             return value.tolist()
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value

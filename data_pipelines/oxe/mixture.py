@@ -25,8 +25,11 @@ ENDLESS = 1 << 40
 
 
 @dataclasses.dataclass(frozen=True)
-class Camera:
-    """intrinsics: float32 (3, 3). world_from_camera: float32 (4, 4). depth: encoded, counts of `depth_unit` metres."""
+class CalibratedDepth:
+    """The camera and the depth map of one picture.
+
+    intrinsics: float32 (3, 3). world_from_camera: float32 (4, 4). depth: encoded, counts of `depth_unit` metres.
+    """
 
     intrinsics: np.ndarray
     world_from_camera: np.ndarray
@@ -44,7 +47,7 @@ class EncodedSample:
     instruction: str
     picture: bytes
     format: ImageFormat
-    camera: Camera | None
+    camera: CalibratedDepth | None
     pose: np.ndarray
     gripper_open: np.ndarray
     target_pose: np.ndarray | None
@@ -55,7 +58,7 @@ class EncodedSample:
 class OpenDataset:
     """One dataset of the mixture: its build, its index, and its episodes one by one."""
 
-    def __init__(self, build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True):
+    def __init__(self, build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True) -> None:
         self.build, self.dataset, self.config = build, dataset, config
         self.view = main_view(dataset)
         self.index: Index = load_index(self.build, dataset, config, progress)
@@ -107,14 +110,16 @@ class OpenDataset:
             for i, frame in enumerate(targets.frame)
         ]
 
-    def _cameras(self, episode: RldsEpisode) -> list[Camera]:
+    def _cameras(self, episode: RldsEpisode) -> list[CalibratedDepth]:
         depth = self.dataset.depth
         if depth is None:
             return []
         intrinsics, poses = depth.cameras(episode)
         path = f"steps/observation/{depth.key}"
         encoded, kind = list(episode.encoded(path)), image_format(self.build.features[path])
-        return [Camera(intrinsics[i], poses[i], depth.unit, encoded[i], kind) for i in range(episode.num_steps)]
+        return [
+            CalibratedDepth(intrinsics[i], poses[i], depth.unit, encoded[i], kind) for i in range(episode.num_steps)
+        ]
 
 
 def describe_dataset(opened: OpenDataset) -> str:
@@ -132,7 +137,7 @@ def describe_dataset(opened: OpenDataset) -> str:
 class Stream:
     """One stream's samples of one dataset; at most `keep` blocks of episodes are in memory."""
 
-    def __init__(self, source: OpenDataset, episodes: np.ndarray, window: int, seed: list[int], keep: int):
+    def __init__(self, source: OpenDataset, episodes: np.ndarray, window: int, seed: list[int], keep: int) -> None:
         self._source, self._episodes, self._keep = source, episodes, keep
         self._order = BlockOrder(source.index.samples[episodes], window, seed, keep)
         self._blocks: dict[tuple[int, int], dict[int, list[EncodedSample]]] = {}
@@ -155,7 +160,7 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
     Number i belongs to stream i mod `config.streams`. A stream has its own episodes of every dataset.
     """
 
-    def __init__(self, config: OxeConfig, seed: int, progress: bool = True, at_once: int = 1):
+    def __init__(self, config: OxeConfig, seed: int, progress: bool = True, at_once: int = 1) -> None:
         """at_once: of how many successive numbers threads may ask for any; few records are then read twice."""
         self.config, self.seed = config, seed
         self.datasets, self.weights = open_mixture(config, progress)

@@ -28,10 +28,12 @@ class Motion:
 
     @property
     def num_steps(self) -> int:
+        """T, the steps that are used."""
         return len(self.gripper_command)
 
     @property
     def num_arms(self) -> int:
+        """A, the arms of the robot."""
         return self.gripper_command.shape[1]
 
 

@@ -1,7 +1,6 @@
 """What the policy is to answer at each frame of an episode: the pose or displacement some time ahead."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -131,7 +130,7 @@ def _between(motion: Motion, start: np.ndarray, end: np.ndarray, frame: str) -> 
             positions.append(positions[-1] + (rotations[-1].apply(moved) if frame == "tool" else moved))
             rotations.append(rotations[-1] * turns[step] if frame == "tool" else turns[step] * rotations[-1])
         passed = np.stack(positions)
-        turned: Any = Rotation.concatenate(rotations)
+        turned = Rotation.concatenate(rotations)
         if frame == "tool":
             result[:, arm, :3] = turned[start].inv().apply(passed[end] - passed[start])
             result[:, arm, 3:] = (turned[start].inv() * turned[end]).as_rotvec()

@@ -8,7 +8,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -29,6 +29,7 @@ from data_pipelines.rlbench.files import find_episodes, left_aside, read_recordi
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.errors import DataError
 from dsvla_jax.files import file_digest, hold_folder
+from dsvla_jax.json_values import Json
 from dsvla_jax.ranges import Range, at_least, check_fields, require
 
 EPISODES_PER_SHARD = 20
@@ -210,7 +211,7 @@ def main(options: Options) -> None:
     report(options.out, skipped)
 
 
-def report(out: Path, skipped: list[dict[str, Any]]) -> None:
+def report(out: Path, skipped: list[dict[str, Json]]) -> None:
     """Prints what the folder holds now and what was left out."""
     shards = existing_shards(out, {})
     counts: dict[str, int] = {}

@@ -2,14 +2,13 @@
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
-from tensorflow_datasets.core.features import Dataset, FeaturesDict, Image
+from tensorflow_datasets.core.features import Dataset, FeatureConnector, FeaturesDict, Image
 
 from data_pipelines.rlds.build import Format
 from data_pipelines.rlds.tfrecord import write_records
@@ -30,7 +29,7 @@ def write_build(
     folder: Path,
     name: str,
     features: FeaturesDict,
-    splits: dict[str, Sequence[Any]],
+    splits: Mapping[str, Sequence[Mapping[str, object]]],
     shards: int = 2,
     file_format: Format = "tfrecord",
     version: str = "0.1.0",
@@ -63,7 +62,7 @@ def write_build(
     return build
 
 
-def _stored(feature: Any) -> Any:
+def _stored(feature: FeatureConnector) -> FeatureConnector:
     """The features with each float32 Image as the four-channel PNG that it is stored as: tfds has no TF-free writer."""
     if isinstance(feature, Dataset):
         return Dataset(_stored(feature.feature))

@@ -1,5 +1,7 @@
 """Datasets of UT Austin: VIOLA, BUDS, MUTEX, SAILOR and Sirius."""
 
+from typing import Unpack
+
 from data_pipelines.oxe.columns import Delta, Openness, Pose, Read
 from data_pipelines.oxe.dataset import ArmColumns, OxeDataset
 from data_pipelines.oxe.layouts import (
@@ -12,13 +14,14 @@ from data_pipelines.oxe.layouts import (
     LANGUAGE,
     SCALED,
     SUFFIX,
+    Options,
     closing,
     converted,
     moved,
 )
 
 
-def _state_matrix(name: str, hz: float, *further: str, **options) -> OxeDataset:
+def _state_matrix(name: str, hz: float, *further: str, **options: Unpack[Options]) -> OxeDataset:
     """7 joints, the gripper's width and the hand's 4 x 4 pose as state (VIOLA's and LIBERO's robot stack)."""
     arm = ArmColumns(
         gripper=closing(7),
