@@ -27,7 +27,7 @@ from dsvla_jax.ranges import at_least, require
 
 
 def list_(names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
-    """Names all datasets and mixtures; with names, tells what is known of those datasets.
+    """Names all datasets and mixtures; with names, prints what is known of those datasets.
 
     Args:
         names: datasets.
@@ -36,7 +36,7 @@ def list_(names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
         dataset = get_dataset(name)
         print(f"{name}: {dataset.source}")
         print(f"  {dataset.hz:g} Hz, {dataset.encoding.replace('_', ' ')}, {len(dataset.arms)} arm(s)", end=", ")
-        print("pose told" if dataset.has_pose else "no pose", f"pictures {dict(dataset.images)}", sep=", ")
+        print("pose recorded" if dataset.has_pose else "no pose", f"pictures {dict(dataset.images)}", sep=", ")
         for note in dataset.notes:
             print(f"  - {note}")
     if not names:

@@ -63,7 +63,7 @@ class ArmColumns:
 
 @dataclasses.dataclass(frozen=True)
 class OxeDataset:
-    """How one dataset tells its robot's motion.
+    """How one dataset records its robot's motion.
 
     hz: steps a second. source: where it is published. images: observation keys of the views.
     language: path of the instruction in a step (text, or code points where `code_points`).
@@ -93,7 +93,7 @@ class OxeDataset:
 
     @property
     def has_pose(self) -> bool:
-        """Whether the pose of every end-effector is told."""
+        """Whether the dataset records the pose of every end-effector."""
         return all(arm.pose is not None for arm in self.arms)
 
     def steps(self, episode: RldsEpisode) -> np.ndarray:
@@ -112,7 +112,7 @@ class OxeDataset:
         command = _columns(episode, [arm.gripper for arm in self.arms], "gripper")
         assert command is not None
         state = _columns(episode, [arm.gripper_state for arm in self.arms], "gripper state")
-        # Where it is not measured, the gripper is where it was last told to go.
+        # Where it is not measured, the gripper is where the last command sent it.
         state = np.concatenate([command[:1], command[:-1]]) if state is None else state
         pose, action, joints = (
             None if values is None else values[steps]

@@ -108,7 +108,7 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
 
 
 def _keep(index: Index, path: Path | None) -> None:
-    """Saves the index for the next time, if that is possible: the work goes on without."""
+    """Saves the index for the next time, if that is possible; nothing depends on it."""
     problem = "no cache folder can be written"
     try:
         if path is not None:
@@ -297,6 +297,7 @@ def _pack(index: Index) -> dict[str, Json]:
 
 
 def _unpack(stored: dict[str, Any]) -> Index:
+    # Any: `_pack` wrote it, and the version in the file's name is that of this code.
     arrays = {name: np.array(stored[name], np.int64) for name in ("shard", "record", "samples")}
     offsets = None if stored["offsets"] is None else [np.array(row, np.int64) for row in stored["offsets"]]
     arrays |= {name: np.array(stored[name], np.float64) for name in ("low", "high")}

@@ -61,6 +61,7 @@ class OxeLoader(Iterator[Sample]):
         self._left_out = _LeftOut()
         for entry in self.source.left_out:
             self._left_out.report(entry)
+        # Any: grain's types lose what its `map` makes.
         to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self._left_out.report)
         batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
         options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=ahead)

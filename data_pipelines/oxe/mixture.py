@@ -125,13 +125,13 @@ class OpenDataset:
 def describe_dataset(opened: OpenDataset) -> str:
     """One line: how many episodes have words, and which components of the targets vary."""
     index, episodes = opened.index, opened.num_episodes
-    told = f"{opened.dataset.name}: {episodes - index.unlabelled:,} of {episodes:,} episodes have an instruction"
+    line = f"{opened.dataset.name}: {episodes - index.unlabelled:,} of {episodes:,} episodes have an instruction"
     if index.unlabelled:
-        told += "; the others are " + ("left out" if opened.config.unlabelled == "leave_out" else "kept")
+        line += "; the others are " + ("left out" if opened.config.unlabelled == "leave_out" else "kept")
     constant = index.constant
     varying = len(index.components) - len(constant)
-    told += f"; {varying} of {len(index.components)} components of the targets vary"
-    return told + (f" (constant: {', '.join(constant)})" if constant else "")
+    line += f"; {varying} of {len(index.components)} components of the targets vary"
+    return line + (f" (constant: {', '.join(constant)})" if constant else "")
 
 
 class Stream:
@@ -195,9 +195,9 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
         return self._streams[number][stream].sample(cycle * int(self._turns[number]) + int(occurrence[place]))
 
     def __repr__(self) -> str:
-        told = [(source.dataset.name, source.index.num_samples) for source in self.datasets]
+        sizes = [(source.dataset.name, source.index.num_samples) for source in self.datasets]
         shape = (self.seed, self.config.streams, self.config.window)
-        return f"MixtureSource(datasets={told}, weights={self.weights.tolist()}, seed, streams, window={shape})"
+        return f"MixtureSource(datasets={sizes}, weights={self.weights.tolist()}, seed, streams, window={shape})"
 
     @property
     def num_samples(self) -> int:
@@ -221,10 +221,10 @@ def open_mixture(config: OxeConfig, progress: bool = True) -> tuple[list[OpenDat
     reasons = {name: why_unsupported(get_dataset(name), config) for name in weights}
     refused = {name: reason for name, reason in reasons.items() if reason}
     if refused and config.unsupported == "refuse":
-        told = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+        listed = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
         fix = "Set target to relative, choose" if config.target == "absolute" else "Choose"
         raise UserError(
-            f"mixture: some datasets cannot give {config.target} targets: {told}. {fix} others, or set unsupported to"
+            f"mixture: some datasets cannot give {config.target} targets: {listed}. {fix} others, or set unsupported to"
             " leave_out"
         )
     kept = [name for name in weights if name not in refused]

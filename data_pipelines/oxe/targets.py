@@ -49,8 +49,8 @@ def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targ
     """The targets of an episode of T steps: one for every step but the last.
 
     With a horizon, the target of step t is step t + horizon, or the last one; with key frames, the next key frame. Its
-    displacement is that between reached poses where poses are told, else the composition of the commands in between.
-    The target's gripper is the command in force there (of the last but one step at the end, where the last step's
+    displacement is that between reached poses if the dataset records poses, else the composition of the commands in
+    between. The target's gripper is the command that holds there (of the last but one step at the end, where the last step's
     command was never carried out).
     """
     if reason := why_unsupported(dataset, config):

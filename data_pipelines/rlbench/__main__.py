@@ -1,7 +1,7 @@
 """Import RLBench, PerAct or PerAct2 demonstrations: python -m data_pipelines.rlbench SRC OUT [--skip-bad]
 
 SRC is a folder of tasks as RLBench's generators write it. OUT receives episodes that train.py reads with
---data.source episodes --data.folder OUT --data.tasks all. Interrupted, it goes on with the first missing shard.
+--data.source episodes --data.folder OUT --data.tasks all. Interrupted, it continues with the first missing shard.
 """
 
 import dataclasses
@@ -124,7 +124,7 @@ def require_same_origin(out: Path, origin: dict[str, str | None], before: dict[s
     """Raises DataError if an episode that is in `out` is another one than that of the same name now."""
     for name, digest in origin.items():
         if digest is not None and before.get(name, digest) not in (digest, None):
-            fix = "import each split into a folder of its own; if the data set was mended, delete this one first"
+            fix = "import each split into a folder of its own; if the data set was corrected, delete this one first"
             raise DataError(out, name, "the episode that was imported before", "another of that name", fix)
 
 

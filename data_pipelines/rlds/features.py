@@ -104,7 +104,7 @@ class RldsEpisode:
             else:
                 array = np.fromiter(values, np.int64 if dtype.kind in "iub" else np.float32, count=len(values))
             array = array.astype(dtype, copy=False)
-            # A dimension of -1 cannot be told from no elements; without one, too few of them are an error.
+            # A dimension of -1 cannot be distinguished from no elements; without one, too few of them are an error.
             open_and_empty = not array.size and -1 in shape
             array = np.zeros([max(size, 0) for size in shape], dtype) if open_and_empty else array.reshape(shape)
         except (ValueError, zlib.error) as error:

@@ -1,4 +1,4 @@
-"""The checkpoints of one run folder: saved while training goes on, and restored by whoever needs them."""
+"""The checkpoints of one run folder: saved while training continues, and restored by whoever needs them."""
 
 import contextlib
 import dataclasses
@@ -213,7 +213,7 @@ class RunCheckpoints:
             for folder in self.folder.glob("*.orbax-checkpoint-tmp"):
                 for name in self._saving:
                     require_index(folder / name)
-                # Orbax goes on writing to the files at the top; they hold nothing that is restored.
+                # Orbax keeps writing to the files at the top; they hold nothing that is restored.
                 write_digests(folder, top=False)
 
     @contextlib.contextmanager

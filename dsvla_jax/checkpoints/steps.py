@@ -67,7 +67,7 @@ def _move_aside(step_folder: Path) -> Path:
 
 
 def first_process_decides(decide: Callable[[], int | None]) -> int | None:
-    """What the first process decides, told to all of them. The others wait until it has."""
+    """What the first process decides, sent to all of them. The others wait until it has."""
     chosen = decide() if jax.process_index() == 0 else None
     if jax.process_count() == 1:
         return chosen

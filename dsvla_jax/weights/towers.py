@@ -227,7 +227,7 @@ def flat_shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
 
 
 def summarize(keys: Iterable[str]) -> str:
-    """Keys in one line, those that differ by the layer only told once."""
+    """Keys in one line; those that differ by the layer only are one entry."""
     groups: dict[str, list[str]] = defaultdict(list)
     for key in sorted(keys):
         groups[re.sub(r"\.\d+\.", ".*.", key)].append(key)
@@ -235,7 +235,7 @@ def summarize(keys: Iterable[str]) -> str:
 
 
 def find_prefix(tensors: Iterable[str], name: str, source: Path) -> str:
-    """What a checkpoint puts in front of its names, told from a name that only this kind of tower has."""
+    """What a checkpoint puts in front of its names, by a name that only this kind of tower has."""
     names = list(tensors)
     found = [key.removesuffix(name) for key in names if key == name or key.endswith("." + name)]
     if len(found) != 1:

@@ -29,7 +29,7 @@ NAMES = {
 }
 
 
-# What the metadata of a LLaMA may say. context_length only bounds, and the layout is told from the names.
+# What the metadata of a LLaMA may say. context_length only bounds, and the layout follows from the names.
 KEYS = (
     *("context_length", "embedding_length", "block_count", "feed_forward_length", "vocab_size", "tensor_data_layout"),
     *("attention.head_count", "attention.head_count_kv", "attention.key_length", "attention.value_length"),

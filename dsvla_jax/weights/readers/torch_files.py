@@ -1,4 +1,4 @@
-"""Where the tensors of a PyTorch file (.pth, .pt) lie, told without PyTorch and without running what the file says.
+"""Where the tensors of a PyTorch file (.pth, .pt) lie, found without PyTorch and without running what the file says.
 
 The format since PyTorch 1.6: a zip archive, nothing in it compressed, of data.pkl (a pickle in which a tensor is
 `_rebuild_tensor_v2(storage, offset, size, stride, ...)` and a storage a persistent id) and data/<key>, the storages'
