@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import dsvla_jax.policy
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.report import (

@@ -33,7 +33,9 @@ from data_pipelines.sources import (
     require_data_fits,
     require_oxe_fits,
 )
-from dsvla_jax.checkpoints import RunCheckpoints, has_checkpoints, require_same_shapes, require_writable_path
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.steps import has_checkpoints
+from dsvla_jax.checkpoints.storage import require_same_shapes, require_writable_path
 from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory, parse_options
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.number_targets import number_rows
@@ -62,7 +64,7 @@ from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
 from dsvla_jax.types import Example, HeldOutExample
-from dsvla_jax.weights.base import is_imported, load_for_model, require_base
+from dsvla_jax.weights.backbones import is_imported, load_for_model, require_base
 
 
 def prepare(
@@ -158,7 +160,7 @@ def train(
         frozen = checkpoints.restore_base(frozen)
         restored = checkpoints.restore(loop.arrays_of(state))
         state = loop.state_of(restored)
-        batches.set_state(restored.notes["iterator"])
+        batches.set_state(restored.notes.iterator)
         print(f"resuming {run} at step {restored.step}")
     else:
         checkpoints.save_base(frozen)

@@ -11,9 +11,9 @@ from flax import traverse_util
 
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.types import ModelInputs
-from dsvla_jax.weights.from_hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD
-from dsvla_jax.weights.hugging_face import language_json, vision_json
+from dsvla_jax.weights.readers.hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD
 from dsvla_jax.weights.towers import AXES
+from dsvla_jax.weights.writers.hugging_face import language_json, vision_json
 
 
 class TorchVLA(torch.nn.Module):

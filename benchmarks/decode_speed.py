@@ -34,8 +34,8 @@ from dsvla_jax.model.decode import make_decoder
 from dsvla_jax.model.layers_apart import take_apart
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
-from dsvla_jax.weights.base import import_backbones, load_backbones
-from dsvla_jax.weights.hugging_face import language_json
+from dsvla_jax.weights.backbones import import_backbones, load_backbones
+from dsvla_jax.weights.writers.hugging_face import language_json
 from tests.decoding import log_probability
 from tests.vocabularies import small_tokenizer
 

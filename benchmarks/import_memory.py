@@ -25,8 +25,8 @@ import numpy as np
 import tyro
 
 from dsvla_jax.command_line import fail_with_message
-from dsvla_jax.weights.configs import read_language_config
-from dsvla_jax.weights.from_hugging_face import LLAMA_NAMES, LM_HEAD
+from dsvla_jax.weights.readers.hugging_face import LLAMA_NAMES, LM_HEAD
+from dsvla_jax.weights.readers.hugging_face_config import read_language_config
 from dsvla_jax.weights.towers import tower_shapes
 
 GIB = 2**30
@@ -38,7 +38,7 @@ import numpy as np
 from pathlib import Path
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 jax.distributed.initialize(sys.argv[2], 2, int(sys.argv[3]))
-from dsvla_jax.weights.base import load_backbones, backbone_shapes
+from dsvla_jax.weights.backbones import load_backbones, backbone_shapes
 mesh = jax.make_mesh((2,), ("fsdp",), axis_types=(AxisType.Auto,))
 
 def sharded(leaf):
@@ -140,7 +140,7 @@ def measure(root: Path, options: Options) -> None:
     total = sum(file.stat().st_size for file in source.iterdir())
     limit = 1.3 * largest + GIB
     print(f"source: {total / GIB:.2f} GiB in {options.shards} shards, the largest {largest / GIB:.2f} GiB")
-    (idle,), _ = run([sys.executable, "-c", "import dsvla_jax.weights.base"])
+    (idle,), _ = run([sys.executable, "-c", "import dsvla_jax.weights.backbones"])
     started = time.monotonic()
     command = ["import", str(source), str(out), "--dtype", options.dtype]
     (peak,), _ = run([sys.executable, "-m", "dsvla_jax.weights", *command])

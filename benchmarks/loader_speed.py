@@ -34,9 +34,9 @@ def write_data(folder: Path, episodes: int, copies: int = 1) -> None:
     copies: how many times its shard is listed (as further links to one file).
     """
     from benchmarks.rlds_parity import photograph
-    from data_pipelines.oxe.fixture_build import episode_of, features_of
-    from data_pipelines.oxe.fixture_motion import known_episode
-    from data_pipelines.oxe.fixtures import FIXTURES
+    from data_pipelines.oxe.fixtures.fixture import episode_of, features_of
+    from data_pipelines.oxe.fixtures.known_motion import known_episode
+    from data_pipelines.oxe.fixtures.write import FIXTURES
     from data_pipelines.rlds.writing import encode_image, write_build
 
     rng = np.random.default_rng(0)

@@ -28,7 +28,7 @@ import tyro
 from tqdm import tqdm
 
 import train
-from data_pipelines.oxe.fixtures import write_fixture
+from data_pipelines.oxe.fixtures.write import write_fixture
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.errors import UserError

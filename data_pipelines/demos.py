@@ -49,6 +49,7 @@ class Settings:
     image_size: int = 96
     """Rendered pixels a side."""
     seed: int = 0
+    """Seed; another number gives other demonstrations."""
     split: Literal["train", "validation", "eval"] = "train"
     """The stream of seeds; evaluations start from those of `eval`."""
     perturb: float = 0.03

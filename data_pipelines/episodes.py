@@ -4,10 +4,8 @@ A shard is an array_record file (random access by number) of ``records.pack_epis
 its task, frame counts, size and sha256, because array_record itself reads a truncated file as an empty one.
 """
 
-import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -23,10 +21,9 @@ from data_pipelines.records import (
     picture_size,
     unpack_episode,
 )
-from dsvla_jax.digests import file_digest
 from dsvla_jax.encoding.keypoints import REACHED_RADIUS
-from dsvla_jax.errors import DataError, UserError
-from dsvla_jax.files import write_bytes, writing
+from dsvla_jax.errors import DataError
+from dsvla_jax.files import file_digest, replacing, write_bytes, writing
 
 FORMAT_NAME = "dsvla-episodes"
 FORMAT_VERSION = 1
@@ -54,21 +51,16 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
     sizes = sorted({picture_size(png) for episode in episodes for png in (*episode.rgb_png, *episode.depth_png)})
     if len(sizes) > 1:
         raise DataError(folder / name, "picture size", "one (height, width) for all", str(sizes), _ONE_SIZE)
-    temporary, digests = folder / f"{name}.partial", []
-    try:
-        with writing(folder / name):
-            # The pictures are compressed already; one record a chunk makes random access cheap.
-            writer = array_record_module.ArrayRecordWriter(str(temporary), "group_size:1,uncompressed")
-            for episode in episodes:
-                record = pack_episode(episode)
-                digests.append(hashlib.blake2b(record, digest_size=8).hexdigest())
-                writer.write(record)
-            writer.close()
-    except UserError:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    entry = {
+    digests = []
+    with writing(folder / name), replacing(folder / name) as partial:
+        # The pictures are compressed already; one record a chunk makes random access cheap.
+        writer = array_record_module.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
+        for episode in episodes:
+            record = pack_episode(episode)
+            digests.append(hashlib.blake2b(record, digest_size=8).hexdigest())
+            writer.write(record)
+        writer.close()
+    return {
         "file": name,
         "task": task,
         "num_arms": episodes[0].num_arms if episodes else 0,
@@ -76,12 +68,10 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
         "digests": digests,
         "picture_size": list(sizes[0]) if sizes else None,
         "instructions": sorted({episode.instruction for episode in episodes}),
-        "bytes": temporary.stat().st_size,
-        "sha256": file_digest(temporary),
+        "bytes": (folder / name).stat().st_size,
+        "sha256": file_digest(folder / name),
         **extra,
     }
-    os.replace(temporary, folder / name)
-    return entry
 
 
 def write_index(folder: Path, shards: Sequence[dict[str, Any]], settings: dict[str, Any] | None = None) -> None:

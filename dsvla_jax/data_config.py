@@ -17,6 +17,7 @@ class DataConfig:
     source: Literal["simulator", "episodes"] = "simulator"
     """`simulator`: scripted experts write what `folder` lacks; `episodes`: `folder` as it is, imported or one's own."""
     folder: str = "data/demos"
+    """Folder of the demonstrations."""
     tasks: tuple[str, ...] = ("lamp_on", "put_rubbish_in_bin", "close_fridge", "bimanual_lift_ball")
     """Names of tasks, all, single_arm or dual_arm; of imported or own demonstrations names or all."""
     episodes: int = 100
@@ -24,6 +25,7 @@ class DataConfig:
     image_size: int = 96
     """Rendered pixels a side."""
     seed: int = 0
+    """Seed of the demonstrations that are generated."""
     perturb: float = 0.03
     """Metres by which half of the key poses are missed on purpose, so that the next sample starts off the path."""
     keypoints: Literal["segmentation", "oracle"] = "segmentation"
@@ -38,6 +40,7 @@ class DataConfig:
     keypoint_noise: float = 0.03
     """Metres of uniform noise an axis on the keypoint (paper, section 3.3; the paper leaves its size open)."""
     keypoint_noise_probability: float = 0.5
+    """Share of the samples whose keypoint gets noise."""
     colour_variation: float = 0.0
     """Relative strength of the brightness, contrast and colour variation; 0 turns it off."""
 
@@ -69,6 +72,7 @@ class OxeConfig:
     mixture: tuple[str, ...] = ("oxe_magic_soup_plus_minus",)
     """A named mixture, or datasets as NAME or NAME=WEIGHT; a weight multiplies the dataset's number of samples."""
     split: str = "train"
+    """Split of every dataset, as its builder names it."""
     target: Literal["relative", "absolute"] = "relative"
     """relative: displacement from the present pose, binned between its 1 % and 99 % quantiles; absolute: the pose."""
     horizon: float = 1.0

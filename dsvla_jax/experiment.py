@@ -10,6 +10,7 @@ from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import replacing
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.partition import MESH_AXES
 from dsvla_jax.model.same_sizes import require_same_sizes
@@ -18,15 +19,18 @@ from dsvla_jax.ranges import at_least, check_fields, more_than, require
 
 @dataclasses.dataclass(frozen=True)
 class MeshConfig:
-    """How many devices stand along each axis of the mesh; -1, for one axis, is all that the others leave.
+    """How many devices lie along each axis of the mesh. The default suits models that fit one device.
 
-    data: the batch is split, parameters are copied. fsdp: the batch is split, and parameters and optimizer state too.
-    tensor: the hidden width of each layer is split; keep it within a host. The default suits models that fit a device.
+    One axis may be -1: it takes the devices that the others leave.
     """
 
     data: int = -1
+    """Devices that split the batch and hold whole copies of the parameters; -1 for all that the other axes leave."""
     fsdp: int = 1
+    """Devices that split the batch, the parameters and the optimizer state; -1 for all that the other axes leave."""
     tensor: int = 1
+    """Devices that split the hidden width of each layer; keep them within one host. -1 for all that the other axes
+    leave."""
 
     def __post_init__(self) -> None:
         sizes = {axis: getattr(self, axis) for axis in MESH_AXES}
@@ -54,13 +58,17 @@ class OptimizerConfig:
     """AdamW with linear warm-up and a cosine to `final_fraction` of the peak."""
 
     learning_rate: float = 1e-3
-    """Of the peak."""
+    """Peak learning rate."""
     warmup_steps: int = 50
     """Steps of linear warm-up, but at most a fifth of the run."""
     final_fraction: float = 0.0
+    """Learning rate at the end of the cosine, as a fraction of the peak."""
     weight_decay: float = 0.05
+    """AdamW's decoupled weight decay, on kernels only."""
     beta1: float = 0.9
+    """Decay of Adam's mean of the gradient."""
     beta2: float = 0.95
+    """Decay of Adam's mean of the squared gradient."""
     gradient_clip: float = 1.0
     """Largest norm of the gradient; inf for no limit."""
 
@@ -109,13 +117,19 @@ class Experiment:
     """Everything that decides the outcome of a run."""
 
     encoding: EncodingConfig
+    """How an observation and a text become the network's inputs, and its answer an action."""
     model: ModelConfig
+    """Sizes and switches of the network."""
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
+    """Simulated, imported or own demonstrations."""
     oxe: OxeConfig | None = None
     """Open X-Embodiment episodes to learn from instead of `data`."""
     optimizer: OptimizerConfig = OptimizerConfig()
+    """AdamW and its schedule."""
     validation: ValidationConfig = ValidationConfig()
+    """Comparison with held-out demonstrations."""
     evaluation: EvaluationConfig = EvaluationConfig()
+    """Closed-loop episodes."""
     regime: Literal["full", "lora", "adapters"] = "full"
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
     base: str = ""
@@ -124,6 +138,7 @@ class Experiment:
     tokenizer: str = ""
     """A folder with the language model's vocabulary; empty: the words of the task suite."""
     steps: int = 1000
+    """Training steps."""
     batch_size: int = 32
     """Examples a step, over all devices."""
     gradient_accumulation: int = 1
@@ -136,6 +151,7 @@ class Experiment:
     soft_target_sigma: float = 0.0
     """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0
+    """Seed of the initial parameters, the order of the data and all noise."""
     log_every: int = 20
     """Steps after which the numbers of a step are written, and at the end; 0 for the end alone."""
     validate_every: int = 0
@@ -215,9 +231,8 @@ def _differences(one: Any, other: Any) -> list[str]:
 
 def save_experiment(path: Path, experiment: Experiment) -> None:
     """Writes the experiment as JSON: whole, or not at all."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(dataclasses.asdict(experiment), indent=2) + "\n")
-    partial.replace(path)
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(dataclasses.asdict(experiment), indent=2) + "\n")
 
 
 def load_experiment(path: Path) -> Experiment:

@@ -3,8 +3,11 @@
 import contextlib
 import errno
 import fcntl
+import hashlib
 import os
+import shutil
 import sys
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
@@ -65,17 +68,63 @@ def writing(path: Path) -> Iterator[None]:
         raise UserError(f"{path}: not written: {reason}; {fix}; what was finished before is whole") from error
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Writes a file that appears under its name only once it is whole. Raises UserError naming it if that fails."""
-    partial = path.with_name(f"{path.name}.partial")
-    with writing(path):
-        try:
-            partial.write_bytes(data)
-            os.replace(partial, path)
-        except OSError:
-            with contextlib.suppress(OSError):
-                partial.unlink(missing_ok=True)
-            raise
+@contextlib.contextmanager
+def replacing(path: Path, *, durable: bool = False, shared: bool = False) -> Iterator[Path]:
+    """Yields the path of a file beside `path` to write to, which takes the place of `path` when the block ends.
+
+    If the block raises, `path` stays as it was and the other file is removed.
+
+    durable: wait until the file and its name are on the disk, for what must survive a machine that loses its power.
+    shared: other processes or threads may write the same path at the same time; the last one stays.
+    """
+    token = f".{uuid.uuid4().hex}" if shared else ""
+    partial = path.with_name(f"{path.name}{token}.partial")
+    try:
+        yield partial
+        if durable:
+            _sync(partial)
+        os.replace(partial, path)
+        if durable:
+            _sync(path.parent)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
+
+
+def _sync(path: Path) -> None:
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+@contextlib.contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """Yields a new folder beside `folder` to write to, which is renamed to `folder` when the block ends.
+
+    `folder` must not exist then, or be empty. If the block raises, the new folder is removed. What a killed process
+    left is removed first.
+    """
+    partial = folder.absolute().with_name(f"{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        partial.rename(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> None:
+    """Writes a file that appears under its name only once it is whole; see `replacing`.
+
+    Raises UserError naming the file if that fails.
+    """
+    with writing(path), replacing(path, durable=durable) as partial:
+        partial.write_bytes(data)
 
 
 def write_picture(path: Path, rgb: np.ndarray, compression: int = 1) -> None:
@@ -88,3 +137,9 @@ def write_picture(path: Path, rgb: np.ndarray, compression: int = 1) -> None:
     if not written:
         raise ValueError(f"{path}: expected a picture uint8 (H, W, 3), got {rgb.dtype} {rgb.shape}")
     write_bytes(path, data.tobytes())
+
+
+def file_digest(path: Path) -> str:
+    """Returns a file's sha256, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -14,7 +14,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float
 
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.codec import PoseCodec

@@ -1,6 +1,6 @@
 """Fixture datasets of Open X-Embodiment, loaders of their mixtures, and what is true of a sample."""
 
-from data_pipelines.oxe.fixtures import known_episodes, write_fixture
+from data_pipelines.oxe.fixtures.write import known_episodes, write_fixture
 from data_pipelines.oxe.loader import OxeLoader
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.encode import EncodingConfig

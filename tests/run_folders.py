@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints.run import Arrays, Notes, RunCheckpoints
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
@@ -26,7 +26,14 @@ from tests.small import small_language, small_vision
 
 TOKENIZER = WordTokenizer(vocabulary(["close the box", "stack 2 red blocks"]))
 MODEL = ModelConfig(small_vision(), small_language(TOKENIZER.vocab_size), lora=LoraConfig(rank=2))
+NO_NOTES = Notes(iterator={}, config={})
 MESHES = {"data": MeshConfig(-1, 1, 1), "fsdp": MeshConfig(1, -1, 1)}
+
+
+def variables_only(trainable: Any) -> Arrays:
+    """What a step holds for those who read variables only: the rest is as small as it can be."""
+    one = np.zeros(1, np.int32)
+    return Arrays(trainable, optimizer={"count": one}, counters={"step": one}, rng={"key": one})
 
 
 def write_run(
@@ -63,7 +70,7 @@ def write_run(
     save_policy_config(run, PolicyConfig(encoding, model), TOKENIZER)
     checkpoints = RunCheckpoints(run)
     checkpoints.save_base(frozen)
-    checkpoints.save(1, {"trainable": trainable}, {})
+    checkpoints.save(1, variables_only(trainable), NO_NOTES)
     checkpoints.close()
     return variables
 

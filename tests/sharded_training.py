@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 from jax.experimental import multihost_utils
 
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints.run import Notes, RunCheckpoints
 from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
@@ -127,7 +127,7 @@ def train(experiment: Experiment, devices: int, run: Path | None, until: int, va
     if new and run is not None:
         with contextlib.closing(RunCheckpoints(run)) as checkpoints:
             checkpoints.save_base(frozen)
-            checkpoints.save(until, arrays_of(state), {"iterator": {}, "config": {}})
+            checkpoints.save(until, arrays_of(state), Notes(iterator={}, config={}))
         print("saved", digest((state, frozen)), flush=True)
     if validates:
         sums = jit_validation(experiment, TARGETS, mesh)

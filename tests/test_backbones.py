@@ -12,7 +12,7 @@ import pytest
 from dsvla_jax.model.clip import VisionTower
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, RopeScaling, VisionConfig
 from dsvla_jax.model.llama import KVCache, Llama, rotary_frequencies
-from dsvla_jax.weights.sources import read_language, read_vision
+from dsvla_jax.weights.readers.any_format import read_language, read_vision
 from dsvla_jax.weights.towers import Tower
 from tests.golden.backbones import CLIPS, LLAMAS, RESAMPLED_TO, draw, draw_image
 from tests.safetensors_files import write_checkpoint

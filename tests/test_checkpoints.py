@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.checkpoints.run import Notes, RunCheckpoints
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.experiment import OptimizerConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.training.loop import arrays_of, state_of
 from dsvla_jax.training.state import TrainState, make_optimizer, start_state
 
-NOTES = {"iterator": {"next_index": 7}, "config": {"steps": 10}}
+NOTES = Notes(iterator={"next_index": 7}, config={"steps": 10})
 
 
 OPTIMIZER = make_optimizer(OptimizerConfig(), steps=10)
@@ -86,7 +87,7 @@ def test_a_checkpoint_of_another_size_is_refused_by_name(tmp_path: Path):
         closing(RunCheckpoints(tmp_path)) as checkpoints,
         pytest.raises(CheckpointError, match=r"another model: .*expected \(32, 2\), found \(64, 2\)"),
     ):
-        checkpoints.restore({"trainable": variables(0, width=32)})
+        checkpoints.restore(arrays_of(state(0, width=32)))
 
 
 def test_an_empty_run_says_how_to_train(tmp_path: Path):
@@ -95,7 +96,7 @@ def test_an_empty_run_says_how_to_train(tmp_path: Path):
             closing(RunCheckpoints(tmp_path, read_only=read_only)) as checkpoints,
             pytest.raises(CheckpointError, match="no complete checkpoint; train first"),
         ):
-            checkpoints.restore({})
+            checkpoints.restore(arrays_of(state(0)))
 
 
 def flip(path: Path) -> None:
@@ -224,7 +225,7 @@ def test_a_run_that_was_moved_to_a_folder_with_brackets_is_read(tmp_path: Path):
 
 def test_arrays_without_their_index_do_not_count_as_saved(tmp_path: Path, monkeypatch):
     # In such a folder orbax leaves the index out without a word.
-    monkeypatch.setattr("dsvla_jax.checkpoints.PATTERN_CHARACTERS", "")
+    monkeypatch.setattr("dsvla_jax.checkpoints.run.PATTERN_CHARACTERS", "")
     checkpoints = RunCheckpoints(tmp_path / "[1]")
     with pytest.raises(CheckpointError, match=r"base: manifest.ocdbt is missing"):
         checkpoints.save_base(variables(1))

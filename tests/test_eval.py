@@ -10,7 +10,8 @@ import jax
 import pytest
 
 import eval as program
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.command_line import require_each_option_once
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.errors import UserError
@@ -23,6 +24,7 @@ from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.suite_vocabulary import suite_tokenizer
+from tests.run_folders import NO_NOTES, variables_only
 from tests.small import small_encoding, small_language, small_vision
 from train import advice
 
@@ -42,7 +44,7 @@ INITIALIZE = jax.jit(lambda: initialize(EXPERIMENT.model, jax.random.key(0)))
 def save(run: Path, *steps: int) -> None:
     with closing(RunCheckpoints(run)) as checkpoints:
         for step in steps:
-            checkpoints.save(step, {"trainable": INITIALIZE()}, {})
+            checkpoints.save(step, variables_only(INITIALIZE()), NO_NOTES)
 
 
 def write_run(run: Path, experiment: Experiment = EXPERIMENT) -> Path:

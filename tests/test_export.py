@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from tokenizers import Tokenizer
 
 import dsvla_jax.weights.__main__ as program
-from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import (
     LanguageConfig,
@@ -26,7 +26,7 @@ from dsvla_jax.model.config import (
 )
 from dsvla_jax.model.lora import merge_lora, unmerge_lora
 from dsvla_jax.weights.export import ExportOptions, export_run
-from dsvla_jax.weights.sources import read_language, read_vision
+from dsvla_jax.weights.readers.any_format import read_language, read_vision
 from tests.run_folders import TOKENIZER, write_run
 
 LORA = LoraConfig(rank=3, alpha=7.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import train
-from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, MeshConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig
@@ -23,7 +23,7 @@ from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.sharding import make_mesh
 from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step, model_inputs
-from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
 from tests.run_folders import write_run
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dsvla_jax.model.config import LanguageConfig
-from dsvla_jax.weights.sources import read_language
-from dsvla_jax.weights.tensors import WeightsError
+from dsvla_jax.weights.readers.any_format import read_language
+from dsvla_jax.weights.stored_tensors import WeightsError
 
 gguf = pytest.importorskip("gguf", reason="needs the package gguf: pip install gguf")
 

@@ -11,8 +11,8 @@ import pytest
 from tensorflow_datasets.core import features as tfds_features
 
 from data_pipelines.inspect.__main__ import Options, describe, main
-from data_pipelines.oxe.fixtures import known_episodes, write_fixture
-from data_pipelines.oxe.fixtures_converted import camera_from_world
+from data_pipelines.oxe.fixtures.builds.maniskill import camera_from_world
+from data_pipelines.oxe.fixtures.write import known_episodes, write_fixture
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.rlds.writing import encode_image, write_build
 from dsvla_jax.data_config import OxeConfig

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.variables import split_variables
@@ -81,7 +81,7 @@ def train(
         if checkpoints.latest_step is not None:
             restored = checkpoints.restore(loop.arrays_of(state))
             state = loop.state_of(restored)
-            batches.set_state(restored.notes["iterator"])
+            batches.set_state(restored.notes.iterator)
         with MetricsWriter(run, int(state.step)) as metrics:
             return loop.train(
                 experiment,

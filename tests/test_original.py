@@ -17,10 +17,10 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.llama import Llama
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
-from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
-from dsvla_jax.weights.sources import read_language, read_vision
-from dsvla_jax.weights.tensors import WeightsError
-from dsvla_jax.weights.torch_files import list_tensors
+from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.readers.any_format import read_language, read_vision
+from dsvla_jax.weights.readers.torch_files import list_tensors
+from dsvla_jax.weights.stored_tensors import WeightsError
 
 FOLDER = Path(__file__).parent / "golden" / "original"
 CLIP, LLAMA, ADAPTER = FOLDER / "clip.pt", FOLDER / "llama", FOLDER / "adapter.pth"

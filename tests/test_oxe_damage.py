@@ -9,7 +9,7 @@ from tensorflow_datasets.core.features import Tensor
 from tensorflow_datasets.proto import tf_example_pb2
 
 from data_pipelines.oxe.__main__ import prepare
-from data_pipelines.oxe.fixtures import known_episodes, write_fixture
+from data_pipelines.oxe.fixtures.write import known_episodes, write_fixture
 from data_pipelines.oxe.index import check_pictures, load_index
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.oxe.registry import get_dataset

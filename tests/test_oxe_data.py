@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from data_pipelines.oxe.__main__ import vocabulary as write_words
-from data_pipelines.oxe.fixtures import write_fixture
-from data_pipelines.oxe.fixtures_converted import DEPTH_COUNTS, camera_from_world
+from data_pipelines.oxe.fixtures.builds.maniskill import DEPTH_COUNTS, camera_from_world
+from data_pipelines.oxe.fixtures.write import write_fixture
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import get_dataset

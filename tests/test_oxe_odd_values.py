@@ -5,11 +5,12 @@ import pytest
 
 from data_pipelines.inspect.rlds import describe_build, find_dataset
 from data_pipelines.oxe.__main__ import prepare
-from data_pipelines.oxe.fixture_build import episode_of, features_of
-from data_pipelines.oxe.fixtures import FIXTURES, known_episodes
+from data_pipelines.oxe.columns import Settled
+from data_pipelines.oxe.fixtures.fixture import episode_of, features_of
+from data_pipelines.oxe.fixtures.write import FIXTURES, known_episodes
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.oxe.mixture import open_mixture
-from data_pipelines.oxe.motion import Motion, settled
+from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import get_dataset
 from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.oxe.targets import key_frames
@@ -157,7 +158,7 @@ def test_a_hand_that_only_trembles_comes_to_no_rest():
 )
 def test_a_gripper_on_its_way_counts_as_the_end_that_it_reaches(readings, command):
     values = np.array(readings, np.float32).astype(np.float64)
-    told = settled(lambda _: values[:, None])(None)  # pyright: ignore[reportArgumentType]
+    told = Settled(lambda _: values[:, None])(None)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(told, command, atol=1e-7)
 
 

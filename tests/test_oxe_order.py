@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 
-from data_pipelines.oxe.fixtures import known_episodes
+from data_pipelines.oxe.fixtures.write import known_episodes
 from data_pipelines.oxe.mixture import MixtureSource, OpenDataset
 from data_pipelines.oxe.order import BlockOrder, deal, schedule
 from dsvla_jax.errors import DataError

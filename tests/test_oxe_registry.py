@@ -1,16 +1,17 @@
 """Every dataset of the registry: a build with its own features and a known motion, read back as that motion."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from data_pipelines.oxe.dataset import View
-from data_pipelines.oxe.fixture_build import episode_of, features_of
-from data_pipelines.oxe.fixture_motion import known_episode
-from data_pipelines.oxe.fixtures import FIXTURES, write_fixture, write_fixtures
-from data_pipelines.oxe.registry import DATASETS, MIXTURES, get_dataset, get_mixture
+from data_pipelines.oxe.fixtures.fixture import episode_of, features_of
+from data_pipelines.oxe.fixtures.known_motion import known_episode
+from data_pipelines.oxe.fixtures.write import FIXTURES, write_fixture, write_fixtures
+from data_pipelines.oxe.registry import DATASETS, DESCRIBED_IN, MIXTURES, get_dataset, get_mixture
 from data_pipelines.rlds import writing
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.features import decode_image, image_format
@@ -117,6 +118,30 @@ def test_the_known_motion_is_read_back(name, tmp_path):
             kind = image_format(features[path], view in dataset.bgr)
             picture = decode_image(episode.encoded(path)[step], kind, path)
             assert np.abs(picture.reshape(-1, 3).astype(int) - truth.colour(int(step))).max() <= 3
+
+
+def test_the_table_names_every_dataset_and_its_module():
+    described = {dataset.name: module for module in DESCRIBED_IN.values() for dataset in module.DATASETS}
+    assert described == DESCRIBED_IN
+    assert FIXTURES.keys() == DATASETS.keys()
+
+
+def test_descriptions_are_values():
+    # Functions would print their addresses, and an index could not tell whether they still say the same.
+    assert not [name for name, dataset in DATASETS.items() if " at 0x" in repr(dataset)]
+    assert DATASETS["kuka"].arms == get_dataset("kuka").arms
+
+
+def test_only_the_program_and_tests_use_fixtures():
+    root = Path(__file__).parents[1]
+    files = [*(root / "data_pipelines").rglob("*.py"), *(root / "dsvla_jax").rglob("*.py"), *root.glob("configs/*.py")]
+    users = {
+        str(file.relative_to(root))
+        for file in files
+        if "oxe.fixtures" in file.read_text()
+        and file.relative_to(root).parts[:3] != ("data_pipelines", "oxe", "fixtures")
+    }
+    assert users == {"data_pipelines/oxe/__main__.py"}
 
 
 def test_sources_are_versions_that_are_published():

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from tensorflow_datasets.proto import tf_example_pb2
 
-from data_pipelines.oxe.fixtures import known_episodes, write_fixture
-from data_pipelines.oxe.index import load_index, scan
+from data_pipelines.oxe.columns import Pose, Read
+from data_pipelines.oxe.fixtures.write import known_episodes, write_fixture
+from data_pipelines.oxe.index import VERSION, load_index, scan
 from data_pipelines.oxe.registry import get_dataset
 from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.rlds.build import RldsBuild, TFRecordFile
@@ -105,6 +106,53 @@ def test_statistics_are_kept_until_the_data_change(tmp_path, monkeypatch):
     elsewhere = dataclasses.replace(config, cache=str(tmp_path / "cache"))
     load_index(build, dataset, elsewhere, progress=False)
     assert list((tmp_path / "cache").glob("*.json"))
+
+
+def test_statistics_belong_to_what_the_description_means(tmp_path, monkeypatch, capsys):
+    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6)
+    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
+    config = config_for(tmp_path, ("cmu_stretch",))
+    first = load_index(build, dataset, config, progress=False)
+    arm = dataclasses.replace(dataset.arms[0], pose=Pose(Read("observation/state", 0, 3), "none", scale=0.1))
+    smaller = load_index(build, dataclasses.replace(dataset, arms=(arm,)), config, progress=False)
+    np.testing.assert_allclose(
+        np.asarray(smaller.quantiles)[:, :3], 0.1 * np.asarray(first.quantiles)[:, :3], atol=1e-7
+    )
+    monkeypatch.setattr("data_pipelines.oxe.index.scan", lambda *_: pytest.fail("scanned again"))
+    load_index(build, dataclasses.replace(dataset, notes=("another remark",)), config, progress=False)
+    assert not capsys.readouterr().err
+
+
+def test_an_index_of_another_version_is_reported_and_made_again(tmp_path, monkeypatch, capsys):
+    write_fixture(tmp_path, "cmu_stretch", episodes=2, steps=6)
+    build, dataset = RldsBuild(tmp_path / "cmu_stretch"), get_dataset("cmu_stretch")
+    config = config_for(tmp_path, ("cmu_stretch",))
+    load_index(build, dataset, config, progress=False)
+    current = next((tmp_path / "cmu_stretch" / "0.1.0").glob("dsvla_index_*.json"))
+    old = current.rename(current.with_name("dsvla_index_cmu_stretch_train_0123456789abcdef.json"))
+    load_index(build, dataset, config, progress=False)
+    assert f"{old}: written by another version of this program" in capsys.readouterr().err
+    assert current.read_text() == old.read_text()
+    load_index(build, dataset, config, progress=False)
+    assert not capsys.readouterr().err
+
+
+# By dataset: samples, and the largest displacement of the index (metres, radians).
+INDEXED = {
+    "cmu_stretch": (11, [0.06419, 0.04696, 0.01199, 0.0, 0.0, 0.0]),
+    "bridge_orig": (9, [0.03443, 0.00825, 0.00486, 0.06862, 0.04815, 0.19521]),
+    "utokyo_xarm_bimanual_converted_externally_to_rlds": (11, [0.02487, 0.04763, 0.01411, 0.14584, 0.15735, 0.09201]),
+}
+
+
+def test_the_version_is_raised_where_code_makes_another_index_of_the_same_data(tmp_path):
+    for name, (samples, largest) in INDEXED.items():
+        write_fixture(tmp_path, name, episodes=2, steps=6)
+        index = scan(RldsBuild(tmp_path / name), get_dataset(name), config_for(tmp_path, (name,)), progress=False)
+        assert index.num_samples == samples, f"{name}: raise VERSION in data_pipelines/oxe/index.py, correct INDEXED"
+        assert index.quantiles is not None
+        np.testing.assert_allclose(index.quantiles[-1], largest, atol=1e-4, err_msg="raise VERSION, correct INDEXED")
+    assert VERSION == 4
 
 
 @pytest.mark.parametrize("remote", [False, True])

@@ -19,7 +19,7 @@ from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, Rope
 from dsvla_jax.model.llama import Llama
 from dsvla_jax.model.lora import merge_lora
 from dsvla_jax.weights.export import ExportOptions, export_run
-from dsvla_jax.weights.sources import read_language, read_vision
+from dsvla_jax.weights.readers.any_format import read_language, read_vision
 from tests.golden.backbones import CLIPS, LLAMAS, draw, draw_image, padded_batch
 from tests.run_folders import TOKENIZER, write_run
 

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.encoding.text import WordTokenizer
@@ -27,7 +28,7 @@ from dsvla_jax.policy import (
     save_policy_config,
 )
 from dsvla_jax.types import Camera, Observation
-from tests.run_folders import MESHES, MODEL, write_run
+from tests.run_folders import MESHES, MODEL, NO_NOTES, variables_only, write_run
 from tests.serving import PROMPTS, observation, tiny_policy
 from tests.vocabularies import small_tokenizer
 
@@ -108,7 +109,7 @@ def test_a_run_folder_with_another_vocabulary_is_refused(tmp_path, change):
 
 def test_a_run_folder_keeps_the_tokenizer(policy, tmp_path):
     checkpoints = RunCheckpoints(tmp_path)
-    checkpoints.save(1, {"trainable": policy.variables}, {"iterator": {"position": 0}})
+    checkpoints.save(1, variables_only(policy.variables), NO_NOTES)
     checkpoints.close()
     save_policy_config(tmp_path, policy.config, policy.tokenizer)
     again = load(tmp_path)

@@ -14,7 +14,7 @@ import pytest
 from configs.tiny import config as tiny_config
 from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.rlbench.__main__ import Settings, import_demonstrations
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.command_line import parse_options
 from dsvla_jax.data_config import DataConfig, LearnedFrom, OxeConfig
 from dsvla_jax.errors import UserError
@@ -26,6 +26,7 @@ from dsvla_jax.serving.requests import Expected, parse_request
 from dsvla_jax.sim.seeds import episode_keys
 from examples.robot_client import simulated_robot
 from tests import rlbench_files as files
+from tests.run_folders import NO_NOTES, variables_only
 from tests.serving import tiny_policy
 
 OWN = LearnedFrom("demonstrations", "recorded", (48, 64), (2,), ("lift_box",))
@@ -35,7 +36,7 @@ def write_run(run: Path, learned: LearnedFrom | None) -> Path:
     policy = tiny_policy()
     run.mkdir()
     with contextlib.closing(RunCheckpoints(run)) as checkpoints:
-        checkpoints.save(1, {"trainable": policy.variables}, {})
+        checkpoints.save(1, variables_only(policy.variables), NO_NOTES)
     save_policy_config(run, dataclasses.replace(policy.config, learned_from=learned), policy.tokenizer)
     return run
 

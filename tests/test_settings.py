@@ -13,7 +13,8 @@ import pytest
 
 import train
 from configs import config_names, get_config
-from dsvla_jax.checkpoints import CheckpointError, RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.errors import UserError

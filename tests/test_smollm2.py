@@ -13,7 +13,7 @@ import pytest
 
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.llama import Llama
-from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
 from tests.golden.smollm2 import STRIDE, TEXT
 
 pytestmark = [

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.episodes import EpisodeReader, write_episodes
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from tests.small import SMALL_RUN

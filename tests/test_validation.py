@@ -15,7 +15,7 @@ import train
 from data_pipelines.episodes import EpisodeReader, write_episodes
 from data_pipelines.samples import make_validation_sampler
 from data_pipelines.sources import open_held_out
-from dsvla_jax.checkpoints import RunCheckpoints
+from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.encode import encode_text
 from dsvla_jax.encoding.grammar import build_answer_grammar

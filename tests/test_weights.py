@@ -12,17 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.checkpoints import CheckpointError
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, RopeScaling, VisionConfig
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
 from dsvla_jax.weights import __main__ as program
-from dsvla_jax.weights.base import import_backbones, load_backbones, read_towers
-from dsvla_jax.weights.folder import create_weights
+from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.imported_folder import create_weights
 from dsvla_jax.weights.positions import resample_positions
-from dsvla_jax.weights.safetensors import list_tensors
-from dsvla_jax.weights.sources import read_language, read_vision
-from dsvla_jax.weights.tensors import WeightsError
+from dsvla_jax.weights.readers.any_format import read_language, read_vision
+from dsvla_jax.weights.readers.safetensors import list_tensors
+from dsvla_jax.weights.stored_tensors import WeightsError
 from dsvla_jax.weights.towers import summarize
 from tests.golden.backbones import draw
 from tests.safetensors_files import write_checkpoint
@@ -491,7 +491,7 @@ def test_a_failed_write_leaves_no_folder(tmp_path):
 KILLED = """
 import os, signal
 from pathlib import Path
-from dsvla_jax.weights import base, towers
+from dsvla_jax.weights import backbones, towers
 
 def copy_to(self, array, dtype):
     if self.place[0].startswith("layers/down"):
@@ -499,7 +499,7 @@ def copy_to(self, array, dtype):
     copy(self, array, dtype)
 
 copy, towers.Piece.copy_to = towers.Piece.copy_to, copy_to
-base.import_backbones(Path({source!r}), Path({out!r}))
+backbones.import_backbones(Path({source!r}), Path({out!r}))
 """
 
 
@@ -530,7 +530,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from pathlib import Path
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
-from dsvla_jax.weights.base import backbone_shapes, load_backbones
+from dsvla_jax.weights.backbones import backbone_shapes, load_backbones
 
 jax.config.update("jax_num_cpu_devices", 4)
 mesh = jax.make_mesh((2, 2), ("fsdp", "tensor"), axis_types=(AxisType.Auto,) * 2)

@@ -19,7 +19,7 @@ from data_pipelines.first_look import (
     look_at_mixture,
     views_of,
 )
-from data_pipelines.oxe.fixtures import write_fixture
+from data_pipelines.oxe.fixtures.write import write_fixture
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.oxe.mixture import open_mixture
 from data_pipelines.recording import Recording, make_demonstration

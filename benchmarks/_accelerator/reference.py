@@ -20,6 +20,7 @@ from benchmarks._accelerator.tiny import demonstrations
 from benchmarks.mjx_agreement import outcomes
 from data_pipelines.sources import open_demonstrations
 from dsvla_jax.command_line import configure_jax
+from dsvla_jax.files import write_bytes
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 
@@ -81,9 +82,7 @@ def main(folder: Path, sizes: Sizes, names: list[str]) -> int:
             traceback.print_exc()
             problem.write_text(f"{type(error).__name__}: {error}")
             continue
-        partial = file.with_suffix(".partial")
-        partial.write_bytes(content)
-        partial.replace(file)
+        write_bytes(file, content)
     return 0
 
 

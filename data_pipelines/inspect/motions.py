@@ -59,7 +59,7 @@ def statistics_row(name: str, values: np.ndarray) -> tuple[str, ...]:
 
 
 def draw_motion(motion: Motion) -> np.ndarray:
-    """uint8 (PANEL x panels, WIDTH, 3): what the robot did and was told to do, over the steps that are used."""
+    """uint8 (PANEL x panels, WIDTH, 3): what the robot did and was commanded to do, over the steps that are used."""
     panels = [panel for arm in range(motion.num_arms) for panel in _panels(motion, arm)]
     return np.concatenate([_draw_panel(*panel) for panel in panels])
 
@@ -81,7 +81,7 @@ def _panels(motion: Motion, arm: int) -> list[_Panel]:
         panels.append((f"{side}commanded step, m", motion.action[:, arm, :3], "xyz", _COLOURS))
         panels.append((f"{side}commanded turn a step, rad", motion.action[:, arm, 3:], "xyz", _COLOURS))
     gripper = np.stack([motion.gripper_command[:, arm], motion.gripper_open[:, arm]], axis=1)
-    panels.append((f"{side}gripper, 1 is open", gripper, ("told", "is"), _GRIPPER))
+    panels.append((f"{side}gripper, 1 is open", gripper, ("command", "is"), _GRIPPER))
     return panels
 
 

@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
-from typing import Any
 
 import cv2
 import numpy as np
-from tensorflow_datasets.core.features import Image
+from tensorflow_datasets.core.features import FeatureConnector, Image
 
 from data_pipelines.inspect.motions import STATISTICS, draw_motion, motion_statistics, statistics_row
 from data_pipelines.inspect.page import Page, Section, Table
@@ -29,7 +28,7 @@ WIDE = 16
 def feature_table(build: RldsBuild) -> Table:
     """Every feature with its type and shape."""
 
-    def kind(feature: Any) -> str:
+    def kind(feature: FeatureConnector) -> str:
         dtype = np.dtype(feature.np_dtype)
         return "text" if is_text(feature) else f"picture, {dtype}" if isinstance(feature, Image) else str(dtype)
 
@@ -40,7 +39,7 @@ def feature_table(build: RldsBuild) -> Table:
     return Table("features of an episode", ("feature", "type", "shape"), rows, numbers=False)
 
 
-def _features(build: RldsBuild) -> list[tuple[str, Any]]:
+def _features(build: RldsBuild) -> list[tuple[str, FeatureConnector]]:
     return list(build.features.items())
 
 

@@ -7,15 +7,16 @@ python -m data_pipelines.oxe fixtures data/oxe_fixtures --datasets bridge_datase
 """
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
-from data_pipelines.oxe.fixtures import write_fixtures
+from data_pipelines.oxe.fixtures.write import write_fixtures
 from data_pipelines.oxe.mixture import MixtureSource, describe_dataset
 from data_pipelines.oxe.registry import DATASETS, MIXTURES, get_dataset
 from data_pipelines.oxe.scale import MixtureScale
@@ -26,7 +27,7 @@ from dsvla_jax.ranges import at_least, require
 
 
 def list_(names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
-    """Names all datasets and mixtures; with names, tells what is known of those datasets.
+    """Names all datasets and mixtures; with names, prints what is known of those datasets.
 
     Args:
         names: datasets.
@@ -35,7 +36,7 @@ def list_(names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:
         dataset = get_dataset(name)
         print(f"{name}: {dataset.source}")
         print(f"  {dataset.hz:g} Hz, {dataset.encoding.replace('_', ' ')}, {len(dataset.arms)} arm(s)", end=", ")
-        print("pose told" if dataset.has_pose else "no pose", f"pictures {dict(dataset.images)}", sep=", ")
+        print("pose recorded" if dataset.has_pose else "no pose", f"pictures {dict(dataset.images)}", sep=", ")
         for note in dataset.notes:
             print(f"  - {note}")
     if not names:
@@ -103,7 +104,12 @@ def fixtures(
 
 if __name__ == "__main__":
     with fail_with_message():
-        commands: dict[str, Any] = {"list": list_, "prepare": prepare, "vocabulary": vocabulary, "fixtures": fixtures}
+        commands: dict[str, Callable[..., None]] = {
+            "list": list_,
+            "prepare": prepare,
+            "vocabulary": vocabulary,
+            "fixtures": fixtures,
+        }
         if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
             print(__doc__)
             sys.exit(0 if len(sys.argv) > 1 else 2)

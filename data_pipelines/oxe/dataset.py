@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from data_pipelines.oxe.motion import Arm, Column, Motion, require_finite
+from data_pipelines.oxe.columns import Column, require_finite
+from data_pipelines.oxe.motion import Motion
 from data_pipelines.rlds.features import RldsEpisode
 from dsvla_jax.errors import DataError
 from dsvla_jax.observation_checks import has_words
@@ -46,8 +47,23 @@ class Depth:
 
 
 @dataclasses.dataclass(frozen=True)
+class ArmColumns:
+    """Where one arm's motion stands in an episode.
+
+    pose: (T, 7). action: (T, 6). gripper: (T,), commanded openness. gripper_state: (T,), measured openness.
+    joints: (T, J).
+    """
+
+    gripper: Column
+    pose: Column | None = None
+    action: Column | None = None
+    gripper_state: Column | None = None
+    joints: Column | None = None
+
+
+@dataclasses.dataclass(frozen=True)
 class OxeDataset:
-    """How one dataset tells its robot's motion.
+    """How one dataset records its robot's motion.
 
     hz: steps a second. source: where it is published. images: observation keys of the views.
     language: path of the instruction in a step (text, or code points where `code_points`).
@@ -61,7 +77,7 @@ class OxeDataset:
     hz: float
     source: str
     images: dict[View, str]
-    arms: tuple[Arm, ...]
+    arms: tuple[ArmColumns, ...]
     language: str = "language_instruction"
     code_points: bool = False
     bgr: tuple[View, ...] = ()
@@ -77,7 +93,7 @@ class OxeDataset:
 
     @property
     def has_pose(self) -> bool:
-        """Whether the pose of every end-effector is told."""
+        """Whether the dataset records the pose of every end-effector."""
         return all(arm.pose is not None for arm in self.arms)
 
     def steps(self, episode: RldsEpisode) -> np.ndarray:
@@ -96,7 +112,7 @@ class OxeDataset:
         command = _columns(episode, [arm.gripper for arm in self.arms], "gripper")
         assert command is not None
         state = _columns(episode, [arm.gripper_state for arm in self.arms], "gripper state")
-        # Where it is not measured, the gripper is where it was last told to go.
+        # Where it is not measured, the gripper is where the last command sent it.
         state = np.concatenate([command[:1], command[:-1]]) if state is None else state
         pose, action, joints = (
             None if values is None else values[steps]

@@ -1,41 +1,39 @@
 """One pass over a dataset: where its records are, how many samples each holds, and the statistics of their targets.
 
-Only action and state columns are converted; no picture is decoded. The result is kept beside the data and made again
-where the data, the dataset's description or the targets asked for have changed.
+Only action and state columns are converted; no picture is decoded. The result is kept beside the data. It is made again
+if the data, the values of the dataset's description, the targets asked for or `VERSION` have changed.
 """
 
 import contextlib
 import dataclasses
+import glob
 import hashlib
 import json
 import os
 import sys
-import uuid
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from data_pipelines.oxe import dataset as dataset_module
-from data_pipelines.oxe import motion as motion_module
-from data_pipelines.oxe import registry, targets
-from data_pipelines.oxe.dataset import OxeDataset
+from data_pipelines.oxe.dataset import OxeDataset, View
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.targets import make_targets
 from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild, Shard, TFRecordFile
 from data_pipelines.rlds.features import RldsEpisode
-from dsvla_jax import observation_checks
 from dsvla_jax.command_line import cache_folder
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.encoding import displacement
 from dsvla_jax.encoding.displacement import is_constant
 from dsvla_jax.encoding.text import split_words
 from dsvla_jax.errors import DataError
+from dsvla_jax.files import replacing
+from dsvla_jax.json_values import Json
 from dsvla_jax.observation_checks import check_camera, check_in_view, check_poses
 
-VERSION = 3
+VERSION = 4
+"""Raise it whenever a change of the code changes the index of the same data with the same description."""
 KEPT_FRAMES = 1 << 18
 """Frames whose displacements quantiles are taken from; of more, evenly spaced ones are kept."""
 QUANTILES = 101
@@ -71,6 +69,7 @@ class Index:
 
     @property
     def num_samples(self) -> int:
+        """Of all usable episodes."""
         return int(self.samples.sum())
 
     @property
@@ -95,6 +94,8 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
         # One that was cut short in copying is made again.
         with contextlib.suppress(ValueError):
             return _unpack(json.loads(path.read_text()))
+    if path is not None:
+        _report_other_versions(path, dataset, config)
     index = scan(build, dataset, config, progress)
     if not len(index.samples):
         reasons = "; ".join(f"{where}: {why}" for where, why in index.left_out[:2])
@@ -107,15 +108,13 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
 
 
 def _keep(index: Index, path: Path | None) -> None:
-    """Saves the index for the next time, if that is possible: the work goes on without."""
+    """Saves the index for the next time, if that is possible; nothing depends on it."""
     problem = "no cache folder can be written"
     try:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Not the process's number: it is the same in two containers that share a disk.
-            temporary = path.with_suffix(f".{uuid.uuid4().hex}.partial")
-            temporary.write_text(json.dumps(_pack(index)) + "\n")
-            os.replace(temporary, path)
+            with replacing(path, shared=True) as partial:
+                partial.write_text(json.dumps(_pack(index)) + "\n")
             return
     except OSError as error:
         problem = f"{path}: {error.strerror}"
@@ -227,7 +226,7 @@ def check_camera_and_hands(episode: RldsEpisode, dataset: OxeDataset, motion: Mo
         check_in_view(motion.pose[..., :3], intrinsics[steps], poses[steps], size, episode.where)
 
 
-def main_view(dataset: OxeDataset) -> Any:
+def main_view(dataset: OxeDataset) -> View:
     """The view that the policy sees: the primary one, or the wrist's where there is no other."""
     return "primary" if "primary" in dataset.images else "wrist"
 
@@ -244,14 +243,15 @@ def _leave_out(error: DataError, where: str, left_out: list[tuple[str, str]], co
 
 
 def _fingerprint(build: RldsBuild, dataset: OxeDataset, config: OxeConfig) -> str:
-    """Changes where the files, the features, the code that reads them or the targets change."""
-    code = [dataset_module, *registry.MODULES, motion_module, targets, observation_checks, displacement]
+    """Changes if the files, their features, what the description says of them, or the targets change."""
+    # A description is made of values, columns included, so that its repr is all that it means.
+    meaning = dataclasses.replace(dataset, source="", notes=())
     parts = [
         str(VERSION),
         json.dumps(build.features_json, sort_keys=True),
         repr([(shard.path, shard.records, _stamp(shard.path)) for shard in build.shards(config.split)]),
-        *(Path(str(module.__file__)).read_text() for module in code),
-        repr((dataset.name, config.split, config.target, config.horizon, config.skip_bad, config.unlabelled)),
+        repr(meaning),
+        repr((config.split, config.target, config.horizon, config.skip_bad, config.unlabelled)),
     ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
@@ -262,7 +262,7 @@ def _stamp(path: str) -> tuple[int, float | None] | None:
 
 
 def _cache_path(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, key: str) -> Path | None:
-    name = f"dsvla_index_{dataset.name}_{config.split}_{key[:16]}.json"
+    name = f"{_name(dataset, config)}_v{VERSION}_{key[:16]}.json"
     if config.cache:
         return Path(config.cache) / name
     if not files.is_remote(build.folder) and os.access(build.folder, os.W_OK):
@@ -271,8 +271,24 @@ def _cache_path(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, key: s
     return None if folder is None else folder / "oxe" / name
 
 
-def _pack(index: Index) -> dict[str, Any]:
-    def plain(value: Any) -> Any:
+def _name(dataset: OxeDataset, config: OxeConfig) -> str:
+    return f"dsvla_index_{dataset.name}_{config.split}"
+
+
+def _report_other_versions(path: Path, dataset: OxeDataset, config: OxeConfig) -> None:
+    """Prints why records are read again, if only indexes of other versions of this code are there."""
+    name = _name(dataset, config)
+    found = list(path.parent.glob(f"{glob.escape(name)}_*.json"))
+    if found and not any(file.name.startswith(f"{name}_v{VERSION}_") for file in found):
+        print(
+            f"{found[0]}: written by another version of this program; {dataset.name} is read once more, and the old"
+            " index can be deleted",
+            file=sys.stderr,
+        )
+
+
+def _pack(index: Index) -> dict[str, Json]:
+    def plain(value: object) -> Json:
         if isinstance(value, np.ndarray):
             return value.tolist()
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value
@@ -281,6 +297,7 @@ def _pack(index: Index) -> dict[str, Any]:
 
 
 def _unpack(stored: dict[str, Any]) -> Index:
+    # Any: `_pack` wrote it, and the version in the file's name is that of this code.
     arrays = {name: np.array(stored[name], np.int64) for name in ("shard", "record", "samples")}
     offsets = None if stored["offsets"] is None else [np.array(row, np.int64) for row in stored["offsets"]]
     arrays |= {name: np.array(stored[name], np.float64) for name in ("low", "high")}

@@ -19,14 +19,12 @@ from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.text import Tokenizer, check_words
 from dsvla_jax.errors import DataError, UserError
+from dsvla_jax.json_values import Json
 from dsvla_jax.types import Example
 
 
 class OxeLoader(Iterator[Example[np.ndarray]]):
-    """Endless batches. `scale`: what displacements are binned over, None for absolute targets.
-
-    left_out: records and frames that were skipped so far, and why.
-    """
+    """Endless batches. `scale`: what displacements are binned over, None for absolute targets."""
 
     def __init__(
         self,
@@ -40,7 +38,7 @@ class OxeLoader(Iterator[Example[np.ndarray]]):
         process_count: int = 1,
         num_threads: int | None = None,
         progress: bool = True,
-    ):
+    ) -> None:
         """batch_size: of one process; processes take the numbers of the one stream in turns.
 
         num_threads: that make batches beside the caller, 0 for none; by default one a processor and at most 4, since
@@ -61,8 +59,11 @@ class OxeLoader(Iterator[Example[np.ndarray]]):
                 )
         mixture_scale = MixtureScale(self.source.datasets, self.source.shares) if config.target == "relative" else None
         self.scale: DisplacementScale | None = mixture_scale.scale if mixture_scale else None
-        self.left_out = _Reported(self.source.left_out)
-        to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self.left_out.append)
+        self._left_out = _LeftOut()
+        for entry in self.source.left_out:
+            self._left_out.report(entry)
+        # Any: grain's types lose what its `map` makes.
+        to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self._left_out.report)
         batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
         options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=ahead)
         dataset = batches.map(to_batch).to_iter_dataset(options)
@@ -73,15 +74,20 @@ class OxeLoader(Iterator[Example[np.ndarray]]):
         """Of all datasets, each once."""
         return self.source.num_samples
 
+    @property
+    def left_out(self) -> list[tuple[str, str]]:
+        """Records and frames that were skipped so far, and why."""
+        return self._left_out.listed()
+
     def __next__(self) -> Example[np.ndarray]:
         return next(self._batches)
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> dict[str, Json]:
         """JSON: the position, the data that it belongs to, and the scale that a policy un-normalises with."""
         scale = dataclasses.asdict(self.scale) if self.scale else None
         return {"position": self._batches.get_state(), "data": repr(self.source), "scale": scale}
 
-    def set_state(self, state: dict[str, Any]) -> None:
+    def set_state(self, state: dict[str, Json]) -> None:
         """Goes on from a position. Raises DataError where the data, the mixture or the scale are others than then."""
         then, now = (json.loads(json.dumps(one)) for one in (state, self.get_state()))
         for part in ("data", "scale"):
@@ -94,7 +100,7 @@ class OxeLoader(Iterator[Example[np.ndarray]]):
 class _Batches(grain.sources.RandomAccessDataSource[list[tuple[int, EncodedSample]]]):
     """Frames by the number of the batch, each with its number in the stream. All processes' parts make a run of it."""
 
-    def __init__(self, source: MixtureSource, size: int, process_index: int, process_count: int):
+    def __init__(self, source: MixtureSource, size: int, process_index: int, process_count: int) -> None:
         self._source, self._size, self._index, self._count = source, size, process_index, process_count
 
     def __len__(self) -> int:
@@ -110,17 +116,18 @@ class _Batches(grain.sources.RandomAccessDataSource[list[tuple[int, EncodedSampl
         return f"batches of {self._size * self._count} of {self._source!r}"
 
 
-class _Reported(list[tuple[str, str]]):
-    """Tells each entry once, on standard error."""
+class _LeftOut:
+    """Records and frames that were skipped, each with the reason, in the order in which they were found."""
 
-    def __init__(self, entries: list[tuple[str, str]]):
-        super().__init__()
-        self._seen: set[tuple[str, str]] = set()
-        for entry in entries:
-            self.append(entry)
+    def __init__(self) -> None:
+        self._entries: dict[tuple[str, str], None] = {}
 
-    def append(self, entry: tuple[str, str]) -> None:
-        if entry not in self._seen:
-            self._seen.add(entry)
-            super().append(entry)
-            print(f"left out ({len(self)}): {entry[0]}: {entry[1]}", file=sys.stderr)
+    def report(self, entry: tuple[str, str]) -> None:
+        """Keeps an entry and prints it on standard error, unless it is known."""
+        if entry not in self._entries:
+            self._entries[entry] = None
+            print(f"left out ({len(self._entries)}): {entry[0]}: {entry[1]}", file=sys.stderr)
+
+    def listed(self) -> list[tuple[str, str]]:
+        """Record and reason of each."""
+        return list(self._entries)

@@ -25,8 +25,11 @@ ENDLESS = 1 << 40
 
 
 @dataclasses.dataclass(frozen=True)
-class Camera:
-    """intrinsics: float32 (3, 3). world_from_camera: float32 (4, 4). depth: encoded, counts of `depth_unit` metres."""
+class CalibratedDepth:
+    """The camera and the depth map of one picture.
+
+    intrinsics: float32 (3, 3). world_from_camera: float32 (4, 4). depth: encoded, counts of `depth_unit` metres.
+    """
 
     intrinsics: np.ndarray
     world_from_camera: np.ndarray
@@ -44,7 +47,7 @@ class EncodedSample:
     instruction: str
     picture: bytes
     format: ImageFormat
-    camera: Camera | None
+    camera: CalibratedDepth | None
     pose: np.ndarray
     gripper_open: np.ndarray
     target_pose: np.ndarray | None
@@ -55,7 +58,7 @@ class EncodedSample:
 class OpenDataset:
     """One dataset of the mixture: its build, its index, and its episodes one by one."""
 
-    def __init__(self, build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True):
+    def __init__(self, build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True) -> None:
         self.build, self.dataset, self.config = build, dataset, config
         self.view = main_view(dataset)
         self.index: Index = load_index(self.build, dataset, config, progress)
@@ -107,32 +110,34 @@ class OpenDataset:
             for i, frame in enumerate(targets.frame)
         ]
 
-    def _cameras(self, episode: RldsEpisode) -> list[Camera]:
+    def _cameras(self, episode: RldsEpisode) -> list[CalibratedDepth]:
         depth = self.dataset.depth
         if depth is None:
             return []
         intrinsics, poses = depth.cameras(episode)
         path = f"steps/observation/{depth.key}"
         encoded, kind = list(episode.encoded(path)), image_format(self.build.features[path])
-        return [Camera(intrinsics[i], poses[i], depth.unit, encoded[i], kind) for i in range(episode.num_steps)]
+        return [
+            CalibratedDepth(intrinsics[i], poses[i], depth.unit, encoded[i], kind) for i in range(episode.num_steps)
+        ]
 
 
 def describe_dataset(opened: OpenDataset) -> str:
     """One line: how many episodes have words, and which components of the targets vary."""
     index, episodes = opened.index, opened.num_episodes
-    told = f"{opened.dataset.name}: {episodes - index.unlabelled:,} of {episodes:,} episodes have an instruction"
+    line = f"{opened.dataset.name}: {episodes - index.unlabelled:,} of {episodes:,} episodes have an instruction"
     if index.unlabelled:
-        told += "; the others are " + ("left out" if opened.config.unlabelled == "leave_out" else "kept")
+        line += "; the others are " + ("left out" if opened.config.unlabelled == "leave_out" else "kept")
     constant = index.constant
     varying = len(index.components) - len(constant)
-    told += f"; {varying} of {len(index.components)} components of the targets vary"
-    return told + (f" (constant: {', '.join(constant)})" if constant else "")
+    line += f"; {varying} of {len(index.components)} components of the targets vary"
+    return line + (f" (constant: {', '.join(constant)})" if constant else "")
 
 
 class Stream:
     """One stream's samples of one dataset; at most `keep` blocks of episodes are in memory."""
 
-    def __init__(self, source: OpenDataset, episodes: np.ndarray, window: int, seed: list[int], keep: int):
+    def __init__(self, source: OpenDataset, episodes: np.ndarray, window: int, seed: list[int], keep: int) -> None:
         self._source, self._episodes, self._keep = source, episodes, keep
         self._order = BlockOrder(source.index.samples[episodes], window, seed, keep)
         self._blocks: dict[tuple[int, int], dict[int, list[EncodedSample]]] = {}
@@ -155,7 +160,7 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
     Number i belongs to stream i mod `config.streams`. A stream has its own episodes of every dataset.
     """
 
-    def __init__(self, config: OxeConfig, seed: int, progress: bool = True, at_once: int = 1):
+    def __init__(self, config: OxeConfig, seed: int, progress: bool = True, at_once: int = 1) -> None:
         """at_once: of how many successive numbers threads may ask for any; few records are then read twice."""
         self.config, self.seed = config, seed
         self.datasets, self.weights = open_mixture(config, progress)
@@ -190,9 +195,9 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
         return self._streams[number][stream].sample(cycle * int(self._turns[number]) + int(occurrence[place]))
 
     def __repr__(self) -> str:
-        told = [(source.dataset.name, source.index.num_samples) for source in self.datasets]
+        sizes = [(source.dataset.name, source.index.num_samples) for source in self.datasets]
         shape = (self.seed, self.config.streams, self.config.window)
-        return f"MixtureSource(datasets={told}, weights={self.weights.tolist()}, seed, streams, window={shape})"
+        return f"MixtureSource(datasets={sizes}, weights={self.weights.tolist()}, seed, streams, window={shape})"
 
     @property
     def num_samples(self) -> int:
@@ -216,10 +221,10 @@ def open_mixture(config: OxeConfig, progress: bool = True) -> tuple[list[OpenDat
     reasons = {name: why_unsupported(get_dataset(name), config) for name in weights}
     refused = {name: reason for name, reason in reasons.items() if reason}
     if refused and config.unsupported == "refuse":
-        told = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+        listed = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
         fix = "Set target to relative, choose" if config.target == "absolute" else "Choose"
         raise UserError(
-            f"mixture: some datasets cannot give {config.target} targets: {told}. {fix} others, or set unsupported to"
+            f"mixture: some datasets cannot give {config.target} targets: {listed}. {fix} others, or set unsupported to"
             " leave_out"
         )
     kept = [name for name in weights if name not in refused]

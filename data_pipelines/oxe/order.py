@@ -46,7 +46,7 @@ class BlockOrder:
     samples: int (E,), of each episode. window: episodes a block. keep: how many blocks' orders are remembered.
     """
 
-    def __init__(self, samples: np.ndarray, window: int, seed: list[int], keep: int = 2):
+    def __init__(self, samples: np.ndarray, window: int, seed: list[int], keep: int = 2) -> None:
         self._samples, self._window, self._seed, self._keep = samples, window, seed, keep
         self.num_samples = int(samples.sum())
         self._epochs: dict[int, tuple[np.ndarray, np.ndarray]] = {}

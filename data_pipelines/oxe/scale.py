@@ -17,7 +17,7 @@ class MixtureScale:
     is metric, the range is -1 to 1.
     """
 
-    def __init__(self, datasets: Sequence[OpenDataset], shares: np.ndarray):
+    def __init__(self, datasets: Sequence[OpenDataset], shares: np.ndarray) -> None:
         """shares: (D,), of each dataset in the samples."""
         quantiles = [np.asarray(item.index.quantiles) for item in datasets]
         metric = [item.dataset.metric for item in datasets]

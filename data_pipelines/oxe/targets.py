@@ -1,7 +1,6 @@
 """What the policy is to answer at each frame of an episode: the pose or displacement some time ahead."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -50,9 +49,9 @@ def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targ
     """The targets of an episode of T steps: one for every step but the last.
 
     With a horizon, the target of step t is step t + horizon, or the last one; with key frames, the next key frame. Its
-    displacement is that between reached poses where poses are told, else the composition of the commands in between.
-    The target's gripper is the command in force there (of the last but one step at the end, where the last step's
-    command was never carried out).
+    displacement is that between reached poses if the dataset records poses, else the composition of the commands in
+    between. The target's gripper is the command that holds there (of the last but one step at the end, where the last
+    step's command was never carried out).
     """
     if reason := why_unsupported(dataset, config):
         raise UserError(f"{dataset.name}: cannot give {config.target} targets: {reason}; leave it out of the mixture")
@@ -131,7 +130,7 @@ def _between(motion: Motion, start: np.ndarray, end: np.ndarray, frame: str) -> 
             positions.append(positions[-1] + (rotations[-1].apply(moved) if frame == "tool" else moved))
             rotations.append(rotations[-1] * turns[step] if frame == "tool" else turns[step] * rotations[-1])
         passed = np.stack(positions)
-        turned: Any = Rotation.concatenate(rotations)
+        turned = Rotation.concatenate(rotations)
         if frame == "tool":
             result[:, arm, :3] = turned[start].inv().apply(passed[end] - passed[start])
             result[:, arm, 3:] = (turned[start].inv() * turned[end]).as_rotvec()

@@ -1,14 +1,14 @@
 """Import RLBench, PerAct or PerAct2 demonstrations: python -m data_pipelines.rlbench SRC OUT [--skip-bad]
 
 SRC is a folder of tasks as RLBench's generators write it. OUT receives episodes that train.py reads with
---data.source episodes --data.folder OUT --data.tasks all. Interrupted, it goes on with the first missing shard.
+--data.source episodes --data.folder OUT --data.tasks all. Interrupted, it continues with the first missing shard.
 """
 
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -27,9 +27,9 @@ from data_pipelines.recording import make_demonstration
 from data_pipelines.records import Episode
 from data_pipelines.rlbench.files import find_episodes, left_aside, read_recording
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
-from dsvla_jax.digests import file_digest
 from dsvla_jax.errors import DataError
-from dsvla_jax.files import hold_folder
+from dsvla_jax.files import file_digest, hold_folder
+from dsvla_jax.json_values import Json
 from dsvla_jax.ranges import Range, at_least, check_fields, require
 
 EPISODES_PER_SHARD = 20
@@ -124,7 +124,7 @@ def require_same_origin(out: Path, origin: dict[str, str | None], before: dict[s
     """Raises DataError if an episode that is in `out` is another one than that of the same name now."""
     for name, digest in origin.items():
         if digest is not None and before.get(name, digest) not in (digest, None):
-            fix = "import each split into a folder of its own; if the data set was mended, delete this one first"
+            fix = "import each split into a folder of its own; if the data set was corrected, delete this one first"
             raise DataError(out, name, "the episode that was imported before", "another of that name", fix)
 
 
@@ -211,7 +211,7 @@ def main(options: Options) -> None:
     report(options.out, skipped)
 
 
-def report(out: Path, skipped: list[dict[str, Any]]) -> None:
+def report(out: Path, skipped: list[dict[str, Json]]) -> None:
     """Prints what the folder holds now and what was left out."""
     shards = existing_shards(out, {})
     counts: dict[str, int] = {}

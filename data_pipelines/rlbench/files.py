@@ -12,9 +12,9 @@ PerAct2; ``rlbench/backend/utils.py`` for how depth is packed into PNG.
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import SupportsIndex
 
 import cv2
 import numpy as np
@@ -120,14 +120,14 @@ def left_aside(folder: Path, camera: str) -> list[str]:
     return sorted(kinds - {f"{camera}_rgb", f"{camera}_depth"})
 
 
-def _check_camera_name(camera: str, misc: Any, path: Path) -> None:
+def _check_camera_name(camera: str, misc: Mapping[str, object], path: Path) -> None:
     ending = "_camera_extrinsics"
     cameras = sorted(name.removesuffix(ending) for name in misc if name.endswith(ending))
     if cameras and not any(name.startswith(f"{camera}_camera_") for name in misc):
         raise DataError(path, "camera", f"one of {', '.join(cameras)}", repr(camera), "choose one with --camera")
 
 
-def _field(record: Any, name: str, number: int, path: Path) -> Any:
+def _field(record: object, name: str, number: int, path: Path) -> object:
     """An attribute of a pickled object or an entry of a pickled dict."""
     try:
         return record.field(name) if isinstance(record, Node) else record[name]
@@ -135,7 +135,7 @@ def _field(record: Any, name: str, number: int, path: Path) -> Any:
         raise DataError(path, f"observation {number}: {name}", "to be recorded", "nothing", _FIX) from error
 
 
-def _numbers(record: Any, name: str, shape: tuple[int, ...], number: int, path: Path) -> np.ndarray:
+def _numbers(record: object, name: str, shape: tuple[int, ...], number: int, path: Path) -> np.ndarray:
     value = _field(record, name, number, path)
     try:
         array = to_array(value).astype(np.float64)
@@ -179,7 +179,7 @@ class _Pictures(Sequence[np.ndarray]):
     for. Any number of leading zeros will do. Hidden files are passed over: archives of macOS have them.
     """
 
-    def __init__(self, folder: Path, name: str, count: int, key_poses_only: bool):
+    def __init__(self, folder: Path, name: str, count: int, key_poses_only: bool) -> None:
         self.folder, self.total, self.key_poses_only = folder / name, count, key_poses_only
         files = [path.name for path in sorted(self.folder.glob("[!.]*.png"))]
         if not files:
@@ -214,7 +214,7 @@ class _Pictures(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return self.total
 
-    def __getitem__(self, number: Any) -> np.ndarray:
+    def __getitem__(self, number: SupportsIndex) -> np.ndarray:
         if int(number) not in self.names:
             raise self._missing(int(number))
         return read_png(self.folder / self.names[int(number)])
@@ -223,11 +223,13 @@ class _Pictures(Sequence[np.ndarray]):
 class _DepthMaps(_Pictures):
     """The depth maps of one camera in metres, 0 where missing."""
 
-    def __init__(self, folder: Path, name: str, count: int, key_poses_only: bool, near: np.ndarray, far: np.ndarray):
+    def __init__(
+        self, folder: Path, name: str, count: int, key_poses_only: bool, near: np.ndarray, far: np.ndarray
+    ) -> None:
         super().__init__(folder, name, count, key_poses_only)
         self.near, self.far = near, far
 
-    def __getitem__(self, number: Any) -> np.ndarray:
+    def __getitem__(self, number: SupportsIndex) -> np.ndarray:
         near, far = float(self.near[number]), float(self.far[number])
         depth = unpack_depth(super().__getitem__(number), near, far)
         # At the far plane nothing was hit.

@@ -11,7 +11,6 @@ PerAct2; NumPy's own helpers for arrays and scalars, under the module names of N
 import io
 import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -56,21 +55,23 @@ class Node:
     """An object of a pickle that was not made: the arguments and the state it would have been made with."""
 
     name = ""
-    args: tuple[Any, ...]
-    state: Any
+    args: tuple[object, ...]
+    state: object
 
-    def __new__(cls, *args: Any) -> "Node":
+    def __new__(cls, *args: object) -> "Node":
+        """Keeps the arguments."""
         node = super().__new__(cls)
         node.args, node.state = args, None
         return node
 
-    def __init__(self, *args: Any):
+    def __init__(self, *args: object) -> None:
         del args
 
-    def __setstate__(self, state: Any) -> None:
+    def __setstate__(self, state: object) -> None:
+        """Keeps the state."""
         self.state = state
 
-    def field(self, name: str) -> Any:
+    def field(self, name: str) -> object:
         """An attribute of the object. Raises KeyError where it has none of that name."""
         if not isinstance(self.state, dict):
             raise KeyError(name)
@@ -86,14 +87,15 @@ class _Refused(Exception):
 
 
 class _Unpickler(pickle.Unpickler):
-    def find_class(self, module_name: str, global_name: str) -> Any:
+    def find_class(self, module_name: str, global_name: str) -> type[Node]:
+        """A class that makes nothing. Raises _Refused for a name that RLBench's files have no use for."""
         if (module_name, global_name) not in KNOWN_NAMES:
             raise _Refused(f"{module_name}.{global_name}")
         # A class of its own for every mention: whatever a pickle does to it is forgotten with the file.
         return type("Node", (Node,), {"name": global_name})
 
 
-def read_pickle(path: Path) -> Any:
+def read_pickle(path: Path) -> object:
     """The contents of a pickle as plain Python values and `Node` objects.
 
     Raises DataError naming the file where it is missing, damaged, or names anything unknown.
@@ -113,7 +115,7 @@ def read_pickle(path: Path) -> Any:
         raise DataError(path, "pickle", "a whole pickle", got, fix) from error
 
 
-def to_array(value: Any) -> np.ndarray:
+def to_array(value: object) -> np.ndarray:
     """Numbers of a pickle, plain or NumPy's, as an array. Raises ValueError where they are neither."""
     if not isinstance(value, Node):
         if isinstance(value, list | tuple) and any(isinstance(item, Node) for item in value):
@@ -132,7 +134,7 @@ def to_array(value: Any) -> np.ndarray:
     raise ValueError(f"a pickled {value.name} is not an array")
 
 
-def _array(data: Any, dtype: Node, shape: tuple[Any, ...], order: str) -> np.ndarray:
+def _array(data: object, dtype: Node, shape: tuple[int, ...], order: str) -> np.ndarray:
     match data:
         case Node(name="encode", args=(str() as text, "latin1")):
             data = text.encode("latin1")

@@ -6,9 +6,10 @@ parquet. All hold the same ``tf.train.Example``.
 
 import dataclasses
 import json
+import os
 import re
 from functools import cached_property
-from typing import Any, BinaryIO, Literal, Protocol
+from typing import BinaryIO, Literal, Protocol
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from data_pipelines.rlds import files
 from data_pipelines.rlds.features import RldsEpisode, parse_features
 from data_pipelines.rlds.tfrecord import read_record, record_offsets
 from dsvla_jax.errors import DataError
+from dsvla_jax.json_values import Json
 
 Format = Literal["tfrecord", "array_record", "parquet"]
 FORMATS: tuple[Format, ...] = ("tfrecord", "array_record", "parquet")
@@ -36,7 +38,7 @@ class RldsBuild:
     folder: that folder; or one of a dataset, whose newest version is then taken; a path or a URL.
     """
 
-    def __init__(self, folder: Any):
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = find_build(files.as_text(folder))
         info_path = files.join(self.folder, "dataset_info.json")
         info = _read_json(info_path)
@@ -84,15 +86,23 @@ class RldsBuild:
 class RecordFile(Protocol):
     """The records of one file by number. ``read`` verifies the checksums that the format has."""
 
-    def __len__(self) -> int: ...
-    def read(self, number: int) -> bytes: ...
-    def close(self) -> None: ...
+    def __len__(self) -> int:
+        """How many records the file has."""
+        ...
+
+    def read(self, number: int) -> bytes:
+        """The record of that number. Raises DataError if it is damaged."""
+        ...
+
+    def close(self) -> None:
+        """Closes the file."""
+        ...
 
 
 class TFRecordFile:
     """A TFRecord file. offsets: (R + 1,), see ``record_offsets``; found by reading all headers where not given."""
 
-    def __init__(self, path: str, offsets: np.ndarray | None = None):
+    def __init__(self, path: str, offsets: np.ndarray | None = None) -> None:
         self.path = path
         self._file: BinaryIO = files.open_binary(path)
         self._known = offsets
@@ -111,16 +121,18 @@ class TFRecordFile:
         return len(self.offsets) - 1
 
     def read(self, number: int) -> bytes:
+        """See `RecordFile`."""
         return read_record(self._file, int(self.offsets[number]), f"{self.path}, record {number}")
 
     def close(self) -> None:
+        """Closes the file."""
         self._file.close()
 
 
 class ArrayRecordFile:
     """An array_record file, on a local path. Its chunks carry checksums, which its own reader verifies."""
 
-    def __init__(self, path: str):
+    def __init__(self, path: str) -> None:
         from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
 
         if files.is_remote(path) or not files.exists(path):
@@ -139,6 +151,7 @@ class ArrayRecordFile:
         return int(self._reader.num_records())
 
     def read(self, number: int) -> bytes:
+        """See `RecordFile`."""
         try:
             (record,) = self._reader.read([number])
         except (RuntimeError, ValueError, IndexError) as error:
@@ -147,13 +160,14 @@ class ArrayRecordFile:
         return record
 
     def close(self) -> None:
+        """Closes the file."""
         self._reader.close()
 
 
 class ParquetFile:
     """A parquet file of serialised examples in the column ``data``, as tfds writes it; one row group is in memory."""
 
-    def __init__(self, path: str):
+    def __init__(self, path: str) -> None:
         import pyarrow
         import pyarrow.parquet as parquet
 
@@ -166,12 +180,13 @@ class ParquetFile:
             raise DataError(path, "file", "a parquet file", str(error), "copy the file again") from error
         groups = range(self._parquet.num_row_groups)
         self._first = np.cumsum([0] + [self._parquet.metadata.row_group(group).num_rows for group in groups])
-        self._group: tuple[int, Any] = (-1, None)
+        self._group: tuple[int, pyarrow.ChunkedArray | None] = (-1, None)
 
     def __len__(self) -> int:
         return int(self._first[-1])
 
     def read(self, number: int) -> bytes:
+        """See `RecordFile`."""
         group = int(np.searchsorted(self._first, number, side="right")) - 1
         if self._group[0] != group:
             try:
@@ -182,6 +197,7 @@ class ParquetFile:
         return self._group[1][number - int(self._first[group])].as_py()
 
     def close(self) -> None:
+        """Closes the file."""
         self._parquet.close()
         self._file.close()
 
@@ -210,7 +226,7 @@ def _shard_name(template: str, dataset: str, split: str, suffix: str, number: in
     return re.sub(r"\{(\w+)\}", lambda match: values.get(match[1], match[0]), template)
 
 
-def _read_json(path: str) -> dict[str, Any]:
+def _read_json(path: str) -> dict[str, Json]:
     try:
         value = json.loads(files.read_text(path))
     except ValueError as error:

@@ -6,9 +6,8 @@ Datasets' feature definitions are used; TensorFlow is not.
 
 import dataclasses
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,17 +21,19 @@ from tensorflow_datasets.core.features import (
     Tensor,
 )
 from tensorflow_datasets.core.features.tensor_feature import Encoding
-from tensorflow_datasets.proto import tf_example_pb2
+from tensorflow_datasets.proto import tf_example_pb2, tf_feature_pb2
 
 from dsvla_jax.errors import DataError
+from dsvla_jax.json_values import Json
 
 STEPS = "steps"
+Raw = bytes | int | float
 # Bytes within which a picture's end marker has to be: some writers pad.
 _TAIL = 64
 _FIX = "is features.json that of these records? Or leave bad records out with --skip-bad"
 
 
-def parse_features(json_value: Any, where: object) -> dict[str, FeatureConnector]:
+def parse_features(json_value: Mapping[str, Json], where: object) -> dict[str, FeatureConnector]:
     """The leaves of a parsed ``features.json`` by their path, as ``steps/observation/image``."""
     try:
         features = FeatureConnector.from_json(json_value)
@@ -42,7 +43,7 @@ def parse_features(json_value: Any, where: object) -> dict[str, FeatureConnector
     return dict(_leaves(features, ""))
 
 
-def _leaves(feature: FeatureConnector, path: str):
+def _leaves(feature: FeatureConnector, path: str) -> Iterator[tuple[str, FeatureConnector]]:
     if isinstance(feature, Dataset):
         yield from _leaves(feature.feature, path)
     elif isinstance(feature, FeaturesDict):
@@ -55,7 +56,7 @@ def _leaves(feature: FeatureConnector, path: str):
 class RldsEpisode:
     """One parsed record. `where` names it in errors, as ``FILE, record 3``. Axis T: steps of the episode."""
 
-    def __init__(self, features: dict[str, FeatureConnector], record: bytes, where: str):
+    def __init__(self, features: dict[str, FeatureConnector], record: bytes, where: str) -> None:
         self.where = where
         self._features = features
         try:
@@ -103,7 +104,7 @@ class RldsEpisode:
             else:
                 array = np.fromiter(values, np.int64 if dtype.kind in "iub" else np.float32, count=len(values))
             array = array.astype(dtype, copy=False)
-            # A dimension of -1 cannot be told from no elements; without one, too few of them are an error.
+            # A dimension of -1 cannot be distinguished from no elements; without one, too few of them are an error.
             open_and_empty = not array.size and -1 in shape
             array = np.zeros([max(size, 0) for size in shape], dtype) if open_and_empty else array.reshape(shape)
         except (ValueError, zlib.error) as error:
@@ -138,13 +139,13 @@ class RldsEpisode:
         height, width, _ = image_format(self._feature(path)).shape
         return self.image(path, 0).shape[:2] if height is None or width is None else (height, width)
 
-    def _feature(self, path: str) -> Any:
+    def _feature(self, path: str) -> FeatureConnector:
         if path not in self._features:
             near = ", ".join(sorted(name for name in self._features if name.split("/")[0] == path.split("/")[0]))
             raise DataError(self.where, path, "a feature of this build", "none of that name", f"it has: {near}")
         return self._features[path]
 
-    def _raw(self, path: str, feature: Any) -> Any:
+    def _raw(self, path: str, feature: FeatureConnector) -> Sequence[Raw]:
         """The values of a leaf as protobuf keeps them, of the kind that the feature tells."""
         if path not in self._values:
             raise DataError(self.where, path, "to be present", "nothing", _FIX)
@@ -170,7 +171,7 @@ class ImageFormat:
     bgr: bool = False
 
 
-def image_format(feature: Any, bgr: bool = False) -> ImageFormat:
+def image_format(feature: FeatureConnector, bgr: bool = False) -> ImageFormat:
     """The format of an Image feature."""
     return ImageFormat(tuple(feature.shape), np.dtype(feature.np_dtype), bgr)
 
@@ -205,39 +206,39 @@ def _is_whole(data: bytes) -> bool:
     return b"\xff\xd9" in data[-_TAIL:] or b"IEND" in data[-_TAIL:]
 
 
-def is_text(feature: Any) -> bool:
+def is_text(feature: FeatureConnector) -> bool:
     """Whether a feature holds strings."""
     return _is_tensor(feature) and np.dtype(feature.np_dtype) == np.object_
 
 
-def is_number(feature: Any) -> bool:
+def is_number(feature: FeatureConnector) -> bool:
     """Whether a feature is a tensor of numbers or truth values."""
     return _is_tensor(feature) and not is_text(feature)
 
 
-def _is_tensor(feature: Any) -> bool:
+def _is_tensor(feature: FeatureConnector) -> bool:
     return isinstance(feature, Tensor)
 
 
-def _values_a_step(feature: Any) -> int:
+def _values_a_step(feature: FeatureConnector) -> int:
     return 1 if _is_bytes(feature) else int(np.prod(feature.shape, dtype=int))
 
 
-def _is_bytes(feature: Any) -> bool:
+def _is_bytes(feature: FeatureConnector) -> bool:
     """Whether a value is stored as one string of bytes."""
     return isinstance(feature, Image) or is_text(feature) or feature._encoding != Encoding.NONE
 
 
-def _is_simple(feature: Any) -> bool:
+def _is_simple(feature: FeatureConnector) -> bool:
     """Whether a value is stored under the feature's own name (several open dimensions take two names)."""
     return isinstance(feature, Image) or feature.shape.count(None) <= (1 if _is_bytes(feature) else 0)
 
 
-def _list_of(values: Any) -> Any:
+def _list_of(values: tf_feature_pb2.Feature) -> Sequence[Raw] | None:
     kind = values.WhichOneof("kind")
     return None if kind is None else getattr(values, kind).value
 
 
 @cache
-def _kind(dtype: Any) -> str:
+def _kind(dtype: np.dtype) -> str:
     return "int64_list" if np.dtype(dtype).kind in "iub" else "float_list"

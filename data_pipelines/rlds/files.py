@@ -2,9 +2,10 @@
 
 import os
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import fsspec
+from fsspec import AbstractFileSystem
 
 from dsvla_jax.errors import DataError
 
@@ -74,11 +75,11 @@ def folders_in(path: str) -> list[str]:
         here = Path(path)
         return sorted(child.name for child in here.iterdir() if child.is_dir()) if here.is_dir() else []
     file_system, name = _file_system(path)
-    entries: list[dict[str, Any]] = file_system.ls(name, detail=True) if file_system.isdir(name) else []
+    entries: list[dict[str, str]] = file_system.ls(name, detail=True) if file_system.isdir(name) else []
     return sorted(entry["name"].rstrip("/").rsplit("/", 1)[-1] for entry in entries if entry["type"] == "directory")
 
 
-def _file_system(path: str) -> tuple[Any, str]:
+def _file_system(path: str) -> tuple[AbstractFileSystem, str]:
     """What fsspec opens a URL with, and the name that it knows the file by."""
     try:
         return fsspec.core.url_to_fs(path)

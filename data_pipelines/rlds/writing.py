@@ -2,18 +2,17 @@
 
 import io
 import json
-import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
-from tensorflow_datasets.core.features import Dataset, FeaturesDict, Image
+from tensorflow_datasets.core.features import Dataset, FeatureConnector, FeaturesDict, Image
 
 from data_pipelines.rlds.build import Format
 from data_pipelines.rlds.tfrecord import write_records
+from dsvla_jax.files import whole_folder
 
 
 def encode_image(picture: np.ndarray, extension: str = ".jpg", quality: int = 95) -> io.BytesIO:
@@ -30,7 +29,7 @@ def write_build(
     folder: Path,
     name: str,
     features: FeaturesDict,
-    splits: dict[str, Sequence[Any]],
+    splits: Mapping[str, Sequence[Mapping[str, object]]],
     shards: int = 2,
     file_format: Format = "tfrecord",
     version: str = "0.1.0",
@@ -41,33 +40,29 @@ def write_build(
     shards: files a split; episodes are dealt out in runs.
     """
     build = folder / name / version
-    partial = build.with_name(f"{version}.partial")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
     described, stored = [], _stored(features)
-    for split, episodes in splits.items():
-        records = [stored.serialize_example(episode) for episode in episodes]
-        runs = [list(map(int, run)) for run in np.array_split(np.arange(len(records)), shards)]
-        for number, run in enumerate(runs):
-            path = partial / f"{name}-{split}.{file_format}-{number:05d}-of-{shards:05d}"
-            _write_shard(path, [records[i] for i in run], file_format)
-        described.append(
-            {
-                "name": split,
-                "shardLengths": [str(len(run)) for run in runs],
-                "numBytes": str(sum(len(record) for record in records)),
-                "filepathTemplate": "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}",
-            }
-        )
-    info = {"name": name, "version": version, "fileFormat": file_format, "moduleName": "", "splits": described}
-    (partial / "dataset_info.json").write_text(json.dumps(info, indent=1) + "\n")
-    (partial / "features.json").write_text(json.dumps(features.to_json(), indent=1) + "\n")
-    partial.rename(build)
+    with whole_folder(build) as partial:
+        for split, episodes in splits.items():
+            records = [stored.serialize_example(episode) for episode in episodes]
+            runs = [list(map(int, run)) for run in np.array_split(np.arange(len(records)), shards)]
+            for number, run in enumerate(runs):
+                path = partial / f"{name}-{split}.{file_format}-{number:05d}-of-{shards:05d}"
+                _write_shard(path, [records[i] for i in run], file_format)
+            described.append(
+                {
+                    "name": split,
+                    "shardLengths": [str(len(run)) for run in runs],
+                    "numBytes": str(sum(len(record) for record in records)),
+                    "filepathTemplate": "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}",
+                }
+            )
+        info = {"name": name, "version": version, "fileFormat": file_format, "moduleName": "", "splits": described}
+        (partial / "dataset_info.json").write_text(json.dumps(info, indent=1) + "\n")
+        (partial / "features.json").write_text(json.dumps(features.to_json(), indent=1) + "\n")
     return build
 
 
-def _stored(feature: Any) -> Any:
+def _stored(feature: FeatureConnector) -> FeatureConnector:
     """The features with each float32 Image as the four-channel PNG that it is stored as: tfds has no TF-free writer."""
     if isinstance(feature, Dataset):
         return Dataset(_stored(feature.feature))

@@ -25,15 +25,15 @@ class PoseCodec:
 
     NumPy arrays in give NumPy arrays out (the data loader's path); anything else goes through jax.numpy and can be
     jitted and vmapped.
-
-    Attributes:
-        low, high: the corners of the workspace box, metres, world frame. Positions outside are moved to its surface.
-        bins: intervals along each side; a position is round(value / step), step = (high - low) / bins.
     """
 
     low: tuple[float, float, float] = (-1.0, -1.0, 0.0)
+    """Lower corner of the box, metres, world frame. Positions outside are moved to its surface."""
     high: tuple[float, float, float] = (1.0, 1.0, 2.0)
+    """Upper corner of the box, metres, world frame."""
     bins: int = 200
+    """Intervals along each side of the box (paper: 200). A position is round(value / step) with step = (high - low) /
+    bins."""
 
     def __post_init__(self):
         metres = Range(-1000, 1000)

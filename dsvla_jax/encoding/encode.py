@@ -27,34 +27,34 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 @dataclasses.dataclass(frozen=True)
 class EncodingConfig:
-    """Everything between an observation and the network; hashable, so it can be a static argument of jit.
-
-    Attributes:
-        image_size, patch_size: of the square image the network sees, pixels.
-        points: the 3D tokenizer.
-        stride: every how many pixels a depth map gives a candidate point.
-        workspace_low, workspace_high: the box of the cloud, metres, world frame. The default floor is just above the
-            table top, which would otherwise take most of the points.
-        alignment: how 3D tokens get their positional embedding.
-        style: of the prompt and answer text.
-        max_text_length: T, tokens of prompt and answer with begin and end.
-        codec: poses as integers.
-        use_keypoints: False drops the keypoint constraint from the prompt.
-        use_points: False drops the 3D tokens (G = 0).
-    """
+    """Everything between an observation and the network; hashable, so it can be a static argument of jit."""
 
     image_size: int = 336
+    """Pixels a side of the square image that the network sees; a multiple of patch_size (paper: 336)."""
     patch_size: int = 14
+    """Pixels a side of one patch (paper: 14)."""
     points: PointTokenizerConfig = dataclasses.field(default_factory=PointTokenizerConfig)
+    """The 3D tokenizer."""
     stride: int = 2
+    """Every how many pixels along each side a depth map gives a candidate point."""
     workspace_low: tuple[float, float, float] = (-1.5, -1.5, 0.76)
+    """Lower corner of the box that the point cloud is cut to, metres, world frame. The default floor is just above the
+    table top, which would otherwise take most of the points."""
     workspace_high: tuple[float, float, float] = (1.5, 1.5, 3.0)
+    """Upper corner of that box, metres, world frame."""
     alignment: AlignmentMode = "aligned"
+    """Which 2D positional embedding a 3D token reuses. aligned: that of the patch its centre projects to (paper).
+    index_order: token i that of patch i, the ablation."""
     style: Style = "paper"
+    """Wording of prompt and answer: paper, as published, or compact, for small vocabularies."""
     max_text_length: int = 512
+    """Tokens of prompt and answer together, with begin and end."""
     codec: PoseCodec = dataclasses.field(default_factory=PoseCodec)
+    """How poses become integers."""
     use_keypoints: bool = True
+    """State the active keypoint of each arm in the prompt (paper, section 3.3); false is the ablation."""
     use_points: bool = True
+    """Give the vision encoder 3D tokens (paper, section 3.2); false is the ablation."""
 
     def __post_init__(self):
         check_fields(

@@ -20,29 +20,27 @@ from dsvla_jax.types import Array
 
 @dataclasses.dataclass(frozen=True)
 class PointTokenizerConfig:
-    """Sizes and scales of the 3D tokenizer.
-
-    Attributes:
-        num_points: P, points of the cloud it takes.
-        group_sizes: centres of each stage; the last is G, the number of tokens.
-        neighbours: K, points grouped around a centre.
-        width: channels of a token; the first features have width / 2^stages.
-        alpha, beta: slowest wavelength ratio and frequency of the positional encoding.
-        center, half_extent: the cube of the workspace, metres, world frame; coordinates are taken to [-1, 1] by it,
-            the scale that alpha and beta are meant for.
-        token_rms: root mean square of every token after standardisation. Set it to that of the vision tower's patch
-            embeddings: larger tokens would drown the positional embeddings added to them.
-    """
+    """Sizes and scales of the 3D tokenizer (paper, section 3.2)."""
 
     num_points: int = 2048
+    """Points that are sampled from the cloud."""
     group_sizes: tuple[int, ...] = (1344, 880, 576)
+    """Centres of each stage; the last is the number of 3D tokens."""
     neighbours: int = 16
+    """Points that are grouped around each centre."""
     width: int = 1024
+    """Channels of a 3D token; the first features have width / 2^stages."""
     alpha: float = 1000.0
+    """Ratio of the highest to the lowest frequency of the positional encoding."""
     beta: float = 100.0
+    """Highest frequency of the positional encoding, radians a unit of the scaled coordinates."""
     center: tuple[float, float, float] = (0.2, 0.0, 1.1)
+    """Centre of the workspace cube, metres, world frame; the cube is scaled to [-1, 1]."""
     half_extent: float = 0.5
+    """Half the side of the workspace cube, metres."""
     token_rms: float = 1.0
+    """Root mean square of every token after standardisation. Set it to that of the vision tower's patch embeddings:
+    larger tokens would drown the positional embeddings added to them."""
 
     def __post_init__(self):
         check_fields(

@@ -19,6 +19,7 @@ from rich.text import Text
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.statistics import wilson_interval
+from dsvla_jax.files import replacing
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.types import Camera
 
@@ -304,9 +305,8 @@ def png_data(rgb: np.ndarray) -> str:
 def write_whole(path: Path, text: str) -> None:
     """Writes a file that appears whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def require_writable(folder: Path) -> None:

@@ -21,20 +21,25 @@ def _require_known(field: str, chosen: tuple[str, ...], known: tuple[str, ...]) 
 
 @dataclasses.dataclass(frozen=True)
 class VisionConfig:
-    """A CLIP vision transformer; the defaults are ViT-L/14 at 336 pixels.
-
-    embed_width: of CLIP's joint embedding of images and text (ViT-L/14: 768), to which every output is then projected,
-        as LLaMA-Adapter reads it; None for the outputs before that projection.
-    """
+    """A CLIP vision transformer; the defaults are the paper's ViT-L/14 at 336 pixels."""
 
     image_size: int = 336
+    """Pixels a side of the square image; a multiple of patch_size."""
     patch_size: int = 14
+    """Pixels a side of one patch."""
     width: int = 1024
+    """Channels of a token; a multiple of heads."""
     layers: int = 24
+    """Transformer layers."""
     heads: int = 16
+    """Attention heads of each layer."""
     mlp_ratio: float = 4.0
+    """Hidden width of each layer's MLP, as a multiple of width."""
     norm_eps: float = 1e-5
+    """Added to the variance in every LayerNorm."""
     embed_width: int | None = None
+    """Width of CLIP's joint embedding of images and text (ViT-L/14: 768), to which every output is projected, as
+    LLaMA-Adapter reads it; None keeps the outputs before that projection."""
 
     def __post_init__(self):
         check_fields(
@@ -76,15 +81,17 @@ class VisionConfig:
 class RopeScaling:
     """Llama 3.1's stretch of the rotary wavelengths beyond the context that the model was first trained with.
 
-    A wavelength that fits less than ``low_frequency_factor`` times into ``original_context`` is multiplied by
-    ``factor``; one that fits more than ``high_frequency_factor`` times is left alone; frequencies between are blended.
-    The defaults are Llama 3.1's.
+    Wavelengths between the two limits are blended. The defaults are Llama 3.1's.
     """
 
     factor: float = 8.0
+    """Multiplies the wavelengths that fit less than low_frequency_factor times into original_context."""
     low_frequency_factor: float = 1.0
+    """Wavelengths that fit fewer times into original_context are multiplied by factor."""
     high_frequency_factor: float = 4.0
+    """Wavelengths that fit more often into original_context stay as they are; more than low_frequency_factor."""
     original_context: int = 8192
+    """Tokens of the context that the model was first trained with."""
 
     def __post_init__(self):
         check_fields(
@@ -105,24 +112,33 @@ class RopeScaling:
 
 @dataclasses.dataclass(frozen=True)
 class LanguageConfig:
-    """A LLaMA decoder; the defaults are LLaMA-7B.
-
-    explicit_head_dim: width of one head; None for width / heads.
-    biases: which linear layers have one. LLaMA's have none; LLaMA-Adapter trains those of q, o, gate, up and down.
-    """
+    """A LLaMA decoder; the defaults are the paper's LLaMA-7B."""
 
     vocab_size: int = 32000
+    """Tokens in the vocabulary."""
     width: int = 4096
+    """Channels of a token; a multiple of 2 * heads unless explicit_head_dim is given."""
     layers: int = 32
+    """Transformer layers."""
     heads: int = 32
+    """Attention heads of the queries."""
     kv_heads: int = 32
+    """Attention heads of keys and values, shared by groups of query heads; a divisor of heads."""
     ffn: int = 11008
+    """Hidden width of each layer's gated MLP."""
     rope_theta: float = 10000.0
+    """Base of the rotary frequencies."""
     norm_eps: float = 1e-6
+    """Added to the mean square in every RMSNorm."""
     tie_embeddings: bool = False
+    """Use the token embedding as the output matrix too."""
     explicit_head_dim: int | None = None
+    """Width of one head, even; None for width / heads."""
     rope_scaling: RopeScaling | None = None
+    """Llama 3.1's stretch of the rotary wavelengths; None leaves them as they are."""
     biases: tuple[str, ...] = ()
+    """Linear layers with a bias, among q, k, v, o, gate, up and down. LLaMA has none; LLaMA-Adapter trains those of q,
+    o, gate, up and down."""
 
     def __post_init__(self):
         check_fields(
@@ -168,22 +184,25 @@ class LanguageConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VisualPromptConfig:
-    """LLaMA-Adapter's way from vision outputs to prompts; the defaults are ManipLLM's, which 3DS-VLA builds on.
-
-    width, layers, heads, ffn, rope_theta, norm_eps: of the visual blocks, transformer layers that see all tokens.
-    queries: 0 makes every visual token a prompt token. Otherwise so many learned queries are read with the visual
-        tokens, and only they become the prompt (LLaMA-Adapter V2: 10).
-    prompted_layers: how many of the language model's layers, counted from its end, look at a prompt; None for all.
-    """
+    """LLaMA-Adapter's way from vision outputs to prompts; the defaults are ManipLLM's, which 3DS-VLA builds on."""
 
     width: int = 1024
+    """Channels of the visual blocks, transformer layers that see all visual tokens; a multiple of 2 * heads."""
     layers: int = 16
+    """Visual blocks."""
     heads: int = 8
+    """Attention heads of each visual block."""
     ffn: int = 2816
+    """Hidden width of the gated MLP of each visual block."""
     rope_theta: float = 10000.0
+    """Base of the rotary frequencies in the visual blocks."""
     norm_eps: float = 1e-5
+    """Added to the mean square in every RMSNorm of the visual blocks."""
     queries: int = 0
+    """Learned tokens that are read with the visual tokens and alone become the prompt (LLaMA-Adapter V2: 10); 0 makes
+    every visual token a prompt token."""
     prompted_layers: int | None = None
+    """Layers of the language model, counted from its end, that attend to a prompt; None for all."""
 
     def __post_init__(self):
         check_fields(
@@ -208,19 +227,19 @@ class VisualPromptConfig:
 
 @dataclasses.dataclass(frozen=True)
 class LoraConfig:
-    """Low-rank adapters: y = x W + (alpha / rank) x A B.
-
-    targets: which linear layers carry one. q, k, v, o of the attentions and up, down of the MLPs exist in both towers,
-        gate in the language model only.
-    towers: which towers carry them.
-    init: distribution of A. "kaiming" is uniform in +-1/sqrt(inputs), as peft's; "normal" has std 0.02. B is zero.
-    """
+    """Low-rank adapters: y = x W + (alpha / rank) x A B, with B zero at the start."""
 
     rank: int = 16
+    """Rank of each adapter."""
     alpha: float = 16.0
+    """Scale of the adapters: their product is multiplied by alpha / rank."""
     targets: tuple[str, ...] = LORA_TARGETS
+    """Linear layers with an adapter: q, k, v, o of the attentions and up, down of the MLPs in both towers, gate in the
+    language model only."""
     towers: tuple[str, ...] = ("vision", "language")
+    """Towers with adapters: vision, language or both."""
     init: Literal["kaiming", "normal"] = "kaiming"
+    """Distribution of A: kaiming is uniform in +-1/sqrt(inputs), as in peft; normal has standard deviation 0.02."""
 
     def __post_init__(self):
         check_fields(self, "model.lora", rank=COUNT, alpha=more_than(0))
@@ -238,40 +257,41 @@ class LoraConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The assembled network.
-
-    point_width: width of a 3D token; the vision tower's width, because 3D tokens enter it as they are. None means that.
-    fusion: how visual tokens enter the language model. "prefix": projected, before the text, so that any model of the
-        Llama family serves. "adapter": as prompts that every layer looks at in an attention of their own, behind a
-        gate that starts closed (LLaMA-Adapter, the paper's lineage).
-    projector: of "prefix", vision -> language width: a "linear" layer, or an "mlp" of two with GELU; LayerNorm follows.
-    visual_prompt: the projection of "adapter".
-    lora: None for no adapters.
-    dtype: of matrix products and activations. Parameters, norms, softmax, rotations and logits are always float32.
-    base_dtype: of the matrices of frozen towers. "same": as dtype. "bfloat16": also where dtype is float32. "int8":
-        the kernels of their layers in 8 bits with a scale for each output (`dsvla_jax.model.quantize`).
-    remat: what the backward pass computes again, a layer at a time: "none", "full" (everything), "dots" (all but the
-        results of products with weights: jax's dots_with_no_batch_dims_saveable), or that policy or another by its
-        name in jax.checkpoint_policies.
-    attention: "by_hand" (two batched products over head-major arrays; the quickest on CPU), "fused"
-        (jax.nn.dot_product_attention as XLA compiles it), "cudnn" (the same as one kernel of cuDNN's: NVIDIA, bfloat16,
-        and cuDNN's limits on lengths), or "auto": "by_hand" on a CPU, "fused" elsewhere.
-    scan_unroll: layers per iteration of the loop over layers. Compile time grows with it, loop overhead shrinks. With
-        as many as the language model has, training also leaves out what its last layer would do for visual tokens.
-    """
+    """The assembled network."""
 
     vision: VisionConfig = VisionConfig()
+    """The vision tower."""
     language: LanguageConfig = LanguageConfig()
+    """The language model."""
     point_width: int | None = None
+    """Channels of a 3D token; must be the vision tower's width, because 3D tokens enter it as they are. None means
+    that."""
     fusion: Literal["prefix", "adapter"] = "prefix"
+    """How visual tokens enter the language model. prefix: projected and put before the text, which works with any model
+    of the Llama family. adapter: as prompts that every layer attends to separately, through a gate that starts closed
+    (LLaMA-Adapter, the paper's lineage)."""
     projector: Literal["linear", "mlp"] = "linear"
+    """Projector from vision to language width with fusion prefix: one linear layer, or an mlp of two with GELU;
+    LayerNorm follows."""
     visual_prompt: VisualPromptConfig = VisualPromptConfig()
+    """The projector with fusion adapter."""
     lora: LoraConfig | None = None
+    """Low-rank adapters; None for none."""
     dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of matrix products and activations. Parameters, norms, softmax, rotations and logits are always float32."""
     base_dtype: Literal["same", "bfloat16", "int8"] = "same"
+    """Type of the matrices of frozen towers. same: as dtype. bfloat16: also if dtype is float32. int8: kernels of their
+    layers in 8 bits, with one scale for each output."""
     remat: Literal["none", "full", "dots", "dots_saveable", "dots_with_no_batch_dims_saveable"] = "none"
+    """What the backward pass computes again, a layer at a time: none, full (everything), or dots (all but the products
+    with weights, jax's dots_with_no_batch_dims_saveable). The other values are policies of jax.checkpoint_policies."""
     attention: Literal["auto", "by_hand", "fused", "cudnn"] = "auto"
+    """by_hand: two batched products over head-major arrays, the fastest on CPU. fused: jax.nn.dot_product_attention as
+    XLA compiles it. cudnn: the same as one cuDNN kernel (NVIDIA, bfloat16, cuDNN's limits on lengths). auto: by_hand on
+    a CPU, fused elsewhere."""
     scan_unroll: int = 1
+    """Layers per iteration of the loop over layers. More layers cost compile time and save loop overhead. With all
+    layers of the language model, training also skips what its last layer would compute for visual tokens."""
 
     def __post_init__(self):
         check_fields(self, "model", point_width=COUNT, scan_unroll=COUNT)

@@ -22,6 +22,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import replacing
 
 EXPLICIT = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
@@ -181,7 +182,6 @@ class Watchdog:
         return self._folder / f"process-{index}.json"
 
     def _write(self) -> None:
-        file = self._file(self._index)
-        partial = file.with_suffix(f".{threading.get_ident()}")
-        partial.write_text(json.dumps(self._note))
-        partial.replace(file)
+        # The watching thread and the one that fails may write at once.
+        with replacing(self._file(self._index), shared=True) as partial:
+            partial.write_text(json.dumps(self._note))

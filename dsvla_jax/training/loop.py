@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from dsvla_jax.checkpoints import Restored, RunCheckpoints
+from dsvla_jax.checkpoints.run import Arrays, Notes, Restored, RunCheckpoints
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.training.chips import peak_flops
 from dsvla_jax.training.flops import model_flops
@@ -137,28 +137,24 @@ def score_of(figures: Mapping[str, float]) -> float | None:
     return error if math.isfinite(error) else None
 
 
-def arrays_of(state: TrainState) -> dict[str, Any]:
+def arrays_of(state: TrainState) -> Arrays:
     """The state as `RunCheckpoints` keeps it."""
-    return {
-        "trainable": state.trainable,
-        "optimizer": state.optimizer,
-        "counters": {"step": state.step, "skipped": state.skipped},
-        "rng": {"key": state.rng},
-    }
+    counters = {"step": state.step, "skipped": state.skipped}
+    return Arrays(state.trainable, state.optimizer, counters, rng={"key": state.rng})
 
 
-def notes_of(experiment: Experiment, batches: Batches) -> dict[str, Any]:
+def notes_of(experiment: Experiment, batches: Batches) -> Notes:
     """What a checkpoint keeps besides arrays."""
-    return {"iterator": batches.get_state(), "config": dataclasses.asdict(experiment)}
+    return Notes(iterator=batches.get_state(), config=dataclasses.asdict(experiment))
 
 
 def state_of(restored: Restored) -> TrainState:
     """The inverse of `arrays_of`."""
     arrays = restored.arrays
     return TrainState(
-        step=arrays["counters"]["step"],
-        trainable=arrays["trainable"],
-        optimizer=arrays["optimizer"],
-        skipped=arrays["counters"]["skipped"],
-        rng=arrays["rng"]["key"],
+        step=arrays.counters["step"],
+        trainable=arrays.trainable,
+        optimizer=arrays.optimizer,
+        skipped=arrays.counters["skipped"],
+        rng=arrays.rng["key"],
     )

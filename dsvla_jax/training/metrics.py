@@ -12,6 +12,7 @@ import jax
 from tensorboardX import SummaryWriter
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.files import replacing
 
 FILE = "metrics.jsonl"
 
@@ -70,12 +71,8 @@ def rewind(path: Path, step: int) -> None:
     if not path.exists():
         return
     kept = [line for line in path.read_text().splitlines(keepends=True) if _step_of(line) <= step]
-    partial = path.with_suffix(".partial")
-    with partial.open("w") as file:
-        file.writelines(kept)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    with replacing(path, durable=True) as partial:
+        partial.write_text("".join(kept))
 
 
 def _step_of(line: str) -> float:

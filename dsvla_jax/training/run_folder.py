@@ -7,7 +7,8 @@ from pathlib import Path
 
 import jax
 
-from dsvla_jax.checkpoints import CheckpointError, has_checkpoints
+from dsvla_jax.checkpoints.steps import has_checkpoints
+from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.experiment import Experiment, load_experiment, outcome_differences
 from dsvla_jax.files import hold_folder
 from dsvla_jax.training.distributed import first_process_first

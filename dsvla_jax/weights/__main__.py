@@ -19,7 +19,7 @@ import tyro
 from dsvla_jax.command_line import fail_with_message, require_each_option_once
 from dsvla_jax.model.config import VisualPromptConfig
 from dsvla_jax.policy import load_policy_config, load_vocabulary
-from dsvla_jax.weights.base import import_backbones
+from dsvla_jax.weights.backbones import import_backbones
 from dsvla_jax.weights.export import ExportOptions, export_run
 from dsvla_jax.weights.towers import summarize
 

@@ -14,29 +14,34 @@ import dataclasses
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 from flax import traverse_util
-from safetensors.numpy import save_file
+from numpy.typing import DTypeLike
 from tqdm import tqdm
 
-from dsvla_jax.checkpoints import RunCheckpoints, StoredVariable, require_same_shapes
+from dsvla_jax.checkpoints.run import RunCheckpoints
+from dsvla_jax.checkpoints.storage import require_same_shapes
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.lora import merge_lora, require_mergeable
 from dsvla_jax.model.variables import PROJECTION
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.weights.folder import new_folder
-from dsvla_jax.weights.from_hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
-from dsvla_jax.weights.hugging_face import language_json, vision_json, write_json, write_tensors, write_tokenizer
+from dsvla_jax.weights.imported_folder import new_folder
+from dsvla_jax.weights.readers.hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
 from dsvla_jax.weights.towers import AXES
+from dsvla_jax.weights.writers.hugging_face import (
+    language_json,
+    vision_json,
+    write_json,
+    write_tensors,
+    write_tokenizer,
+)
+from dsvla_jax.weights.writers.peft import Variables, write_adapters
 
 TOWERS = ("language", "vision")
-
-Variables = Mapping[tuple[str, ...], StoredVariable]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +55,7 @@ class ExportOptions:
     """
 
     merged: bool = False
-    dtype: Any = np.float32
+    dtype: DTypeLike = np.float32
     shard_bytes: float = 2e9
     bases: Mapping[str, str | None] = dataclasses.field(default_factory=dict)
 
@@ -98,7 +103,7 @@ def _write_run(run: Path, folder: Path, model: ModelConfig, tokenizer: Tokenizer
             _write_model(folder / tower, parts, names, model.lora, options)
             _describe_model(folder / tower, tower, model, tokenizer, np.dtype(options.dtype).name)
         else:
-            _write_adapters(folder / tower, tower, parts, names, model, options)
+            write_adapters(folder / tower, tower, parts, names, model, options.dtype, options.bases.get(tower))
     (folder / PROJECTION).mkdir()
     projection = {".".join(p[2:]): leaf for p, leaf in variables.items() if p[:2] == ("params", PROJECTION)}
     sizes = {name: leaf.size * np.dtype(options.dtype).itemsize for name, leaf in projection.items()}
@@ -150,44 +155,3 @@ def _describe_model(folder: Path, tower: str, model: ModelConfig, tokenizer: Tok
     else:
         special = write_tokenizer(folder, tokenizer)
         write_json(folder / "config.json", language_json(model.language, dtype) | special)
-
-
-def _write_adapters(
-    folder: Path, tower: str, parts: Variables, names: Mapping[str, str], model: ModelConfig, options: ExportOptions
-) -> None:
-    """The adapters of a tower as PEFT loads them (https://github.com/huggingface/peft, "LoRA" in its documentation)."""
-    lora = model.lora
-    assert lora is not None
-    # The attribute that a vision tower without projection once was in is gone from transformers 5.
-    alone = tower == "vision" and model.vision.embed_width is None
-    tensors, targets = {}, []
-    for path, leaf in parts.items():
-        if path[0] != "lora":
-            continue
-        module = names["/".join((*path[2:-1], "kernel"))].removesuffix(".weight")
-        module = module.removeprefix("vision_model.") if alone else module
-        targets.append(module.rsplit(".", 1)[-1])
-        for layer, values in enumerate(leaf.read()):
-            key = f"base_model.model.{module.format(layer)}.lora_{path[-1].upper()}.weight"
-            tensors[key] = np.ascontiguousarray(values.T, options.dtype)
-    save_file(tensors, folder / "adapter_model.safetensors", metadata={"format": "pt"})
-    kind = "CLIPVisionModel" if alone else "CLIPVisionModelWithProjection"
-    clip = {"base_model_class": kind, "parent_library": "transformers.models.clip.modeling_clip"}
-    write_json(
-        folder / "adapter_config.json",
-        {
-            "peft_type": "LORA",
-            "task_type": "CAUSAL_LM" if tower == "language" else None,
-            "auto_mapping": None if tower == "language" else clip,
-            "base_model_name_or_path": options.bases.get(tower),
-            "r": lora.rank,
-            "lora_alpha": int(lora.alpha) if lora.alpha == int(lora.alpha) else lora.alpha,
-            "target_modules": sorted(set(targets)),
-            "lora_dropout": 0.0,
-            "bias": "none",
-            "use_rslora": False,
-            "use_dora": False,
-            "fan_in_fan_out": False,
-            "inference_mode": True,
-        },
-    )

@@ -6,19 +6,21 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
+from numpy.typing import DTypeLike
 from tqdm import tqdm
 
+from dsvla_jax.checkpoints.storage import PyTree
 from dsvla_jax.model.clip import VisionTower
-from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
+from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.llama import Llama
 from dsvla_jax.weights.positions import resample_positions
-from dsvla_jax.weights.tensors import StoredTensor, WeightsError
+from dsvla_jax.weights.stored_tensors import StoredTensor, WeightsError
 
 # The path of a parameter, and which layer of it where layers are stacked.
 Place = tuple[str, int | None]
@@ -36,6 +38,16 @@ STACKED = ("layers", "visual_blocks", "adapter_query", "gate")
 ROWS = 2048
 
 
+TowerConfig = LanguageConfig | VisionConfig | VisualPromptConfig | LoraConfig
+"""Sizes of what a checkpoint holds."""
+
+
+class Writable(Protocol):
+    """An array in memory or on disk that takes values at an index."""
+
+    def __setitem__(self, index: tuple[int | slice, ...], values: np.ndarray, /) -> None: ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Piece:
     """A stored tensor, and where it goes. axes: which of the stored axes becomes each of ours."""
@@ -44,14 +56,14 @@ class Piece:
     tensor: StoredTensor
     axes: tuple[int, ...]
 
-    def copy_to(self, array: Any, dtype: Any) -> None:
+    def copy_to(self, array: Writable, dtype: DTypeLike) -> None:
         """Writes the tensor, some rows at a time, to the parameter's array (NumPy or on disk) of ``dtype``."""
         axis, layer = self.axes.index(0), self.place[1]
         head_dim = self.tensor.head_dim or 1
         step = max(ROWS // head_dim, 1) * head_dim
         for start in range(0, self.tensor.shape[0], step):
             rows = self.tensor.read(start, min(start + step, self.tensor.shape[0]))
-            index: list[Any] = [slice(None)] * len(self.axes)
+            index: list[slice] = [slice(None)] * len(self.axes)
             index[axis] = slice(start, start + len(rows))
             array[tuple(index) if layer is None else (layer, *index)] = rows.transpose(self.axes).astype(dtype)
 
@@ -65,7 +77,7 @@ class Tower:
     otherwise than the checkpoint's config, and what is done about it.
     """
 
-    config: Any
+    config: TowerConfig
     shapes: Mapping[str, tuple[int, ...]]
     pieces: tuple[Piece, ...]
     unused: tuple[str, ...]
@@ -77,7 +89,7 @@ class Tower:
         """How many numbers it has."""
         return sum(math.prod(shape) for shape in self.shapes.values())
 
-    def copy_to(self, arrays: Mapping[str, Any], dtype: Any) -> None:
+    def copy_to(self, arrays: Mapping[str, Writable], dtype: DTypeLike) -> None:
         """Fills the arrays (NumPy or on disk) of its parameters; few rows of one tensor are in memory at a time."""
         for path, values in self.computed.items():
             arrays[path][...] = values.astype(dtype)
@@ -112,7 +124,7 @@ class Tower:
                     "another model, or trained that one's weights too; name as the source the model that it belongs to"
                 )
 
-    def load(self, dtype: Any = np.float32) -> dict[str, Any]:
+    def load(self, dtype: DTypeLike = np.float32) -> dict[str, PyTree]:
         """Its parameters in memory, a nested dict."""
         arrays = {path: np.empty(shape, dtype) for path, shape in self.shapes.items()}
         self.copy_to(arrays, dtype)
@@ -120,7 +132,7 @@ class Tower:
 
 
 def assign(
-    config: Any,
+    config: TowerConfig,
     shapes: Mapping[str, tuple[int, ...]],
     names: Mapping[str, str],
     tensors: Mapping[str, StoredTensor],
@@ -209,13 +221,13 @@ def tower_shapes(config: LanguageConfig | VisionConfig) -> dict[str, tuple[int, 
     return flat_shapes(jax.eval_shape(model.init, jax.random.key(0), *arrays)["params"])
 
 
-def flat_shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+def flat_shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
     """The shapes of a nested dict's leaves by path."""
     return {path: leaf.shape for path, leaf in traverse_util.flatten_dict(tree, sep="/").items()}
 
 
 def summarize(keys: Iterable[str]) -> str:
-    """Keys in one line, those that differ by the layer only told once."""
+    """Keys in one line; those that differ by the layer only are one entry."""
     groups: dict[str, list[str]] = defaultdict(list)
     for key in sorted(keys):
         groups[re.sub(r"\.\d+\.", ".*.", key)].append(key)
@@ -223,7 +235,7 @@ def summarize(keys: Iterable[str]) -> str:
 
 
 def find_prefix(tensors: Iterable[str], name: str, source: Path) -> str:
-    """What a checkpoint puts in front of its names, told from a name that only this kind of tower has."""
+    """What a checkpoint puts in front of its names, by a name that only this kind of tower has."""
     names = list(tensors)
     found = [key.removesuffix(name) for key in names if key == name or key.endswith("." + name)]
     if len(found) != 1:

@@ -1,0 +1,1 @@
+"""Formats of other projects that a run is written in."""
