@@ -83,12 +83,12 @@ def known_answers(run: Path, episodes: int) -> list[Known]:
             (answer,) = answer_batch(policy, [Question(instruction, one, keypoints[i, :, 0])])
             request = {
                 "prompt": instruction,
-                "rgb": one.rgb,
-                "depth": one.depth,
-                "intrinsics": one.camera.intrinsics,
-                "world_from_camera": one.camera.world_from_camera,
-                "pose": one.pose,
-                "gripper_open": one.gripper_open,
+                "rgb": one.picture.rgb,
+                "depth": one.picture.depth,
+                "intrinsics": one.picture.camera.intrinsics,
+                "world_from_camera": one.picture.camera.world_from_camera,
+                "pose": one.robot.pose,
+                "gripper_open": one.robot.gripper_open,
                 "keypoints": keypoints[i, :, :1],
                 "reset": True,
             }

@@ -10,7 +10,7 @@ import transformers  # pyright: ignore[reportMissingImports]
 from flax import traverse_util
 
 from dsvla_jax.model.config import ModelConfig
-from dsvla_jax.types import ModelInputs
+from dsvla_jax.types import ModelInputs, named_arrays
 from dsvla_jax.weights.readers.hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD
 from dsvla_jax.weights.towers import AXES
 from dsvla_jax.weights.writers.hugging_face import language_json, vision_json
@@ -59,7 +59,7 @@ class TorchVLA(torch.nn.Module):
         tokens_3d = inputs["point_tokens"] + vision.embeddings.position_embedding.weight[1 + inputs["point_patches"]]
         x = vision.pre_layrnorm(torch.cat([tokens_2d, tokens_3d], dim=1))
         x = vision.post_layernorm(vision.encoder(inputs_embeds=x).last_hidden_state)
-        text = language.model.embed_tokens(inputs["text_tokens"])
+        text = language.model.embed_tokens(inputs["text.tokens"])
         x = torch.cat([self.projector(x), text], dim=1)
         hidden = language.model(inputs_embeds=x, use_cache=False).last_hidden_state
         return language.lm_head(hidden[:, -text.shape[1] :])
@@ -67,7 +67,7 @@ class TorchVLA(torch.nn.Module):
     def loss(self, inputs: Mapping[str, torch.Tensor], answer: torch.Tensor) -> torch.Tensor:
         """Mean cross-entropy over the answer's tokens."""
         logits = self(inputs)[:, :-1][answer[:, 1:]]
-        return torch.nn.functional.cross_entropy(logits, inputs["text_tokens"][:, 1:][answer[:, 1:]])
+        return torch.nn.functional.cross_entropy(logits, inputs["text.tokens"][:, 1:][answer[:, 1:]])
 
 
 def as_torch(variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -102,7 +102,7 @@ def as_torch(variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 def torch_inputs(inputs: ModelInputs) -> dict[str, torch.Tensor]:
     """Our batch, the image with channels first."""
-    arrays = {name: np.array(value) for name, value in vars(inputs).items()}
+    arrays = {name: np.array(value) for name, value in named_arrays(inputs).items()}
     tensors = {
         name: torch.from_numpy(value if value.dtype != np.int32 else value.astype(np.int64))
         for name, value in arrays.items()

@@ -117,18 +117,17 @@ def main(options: Options) -> int:
     theirs = their_model()
     variables = our_variables(theirs, config)
     prompt = format_prompt("close the jar", STATE, KEYPOINT, "paper")
-    tokens, mask, _ = encode_text(tokenizer, prompt, None, 512)
-    length = int(mask.sum())
+    text, _ = encode_text(tokenizer, prompt, None, 512)
+    length = int(text.mask.sum())
     inputs = ModelInputs(
         image=jnp.ones((1, 16, 16, 3)),
         point_tokens=jnp.zeros((1, 0, 32)),
         point_patches=jnp.zeros((1, 0), jnp.int32),
-        text_tokens=jnp.asarray(tokens[None, :length]),
-        text_mask=jnp.ones((1, length), bool),
+        text=jax.tree.map(lambda leaf: jnp.asarray(leaf[None, :length]), text),
     )
     decode = make_decoder(VLA(config), grammar)
     visual: Any = VLA(config).apply(variables, inputs, method=lambda model, x: model.projector(model.encode_vision(x)))
-    embedded = theirs.get_input_embeddings()(torch.from_numpy(tokens[None, :length]).long()).detach().numpy()
+    embedded = theirs.get_input_embeddings()(torch.from_numpy(text.tokens[None, :length]).long()).detach().numpy()
     embeddings = np.concatenate([np.asarray(visual), embedded], axis=1)
     variables = take_apart(variables)
     decoded = decode(variables, inputs)

@@ -20,7 +20,7 @@ from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.decode import Decoding, make_decoder
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.types import ModelInputs
+from dsvla_jax.types import ModelInputs, Text
 from tests.vocabularies import small_tokenizer
 
 BATCH, WIDTH = 250, 32
@@ -71,8 +71,10 @@ def malformed(kind: str, style: Style, arms: int, options: Options) -> tuple[int
             image=jnp.asarray(rng.normal(size=(BATCH, 16, 16, 3)), jnp.float32),
             point_tokens=jnp.asarray(rng.normal(size=(BATCH, 3, WIDTH)), jnp.float32),
             point_patches=jnp.asarray(rng.integers(0, 4, (BATCH, 3)), jnp.int32),
-            text_tokens=jnp.asarray(rng.integers(0, tokenizer.vocab_size, (BATCH, 9)), jnp.int32),
-            text_mask=jnp.arange(9)[None] < jnp.asarray(lengths)[:, None],
+            text=Text(
+                jnp.asarray(rng.integers(0, tokenizer.vocab_size, (BATCH, 9)), jnp.int32),
+                jnp.arange(9)[None] < jnp.asarray(lengths)[:, None],
+            ),
         )
         decoded = decode(attack(variables, grammar, trial, tokenizer), inputs, jax.random.key(trial))
         for integers in np.asarray(decoded.integers):

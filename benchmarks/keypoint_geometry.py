@@ -91,7 +91,7 @@ def measure(name: str, options: Options) -> tuple[list[float], int, list[float]]
     for i in range(options.episodes):
         one: Any = jax.tree.map(lambda x, i=i: np.asarray(x)[i], state)
         task = environment.task
-        phrases, depth = task.phrases(task.words(int(one.variation)))[0], np.asarray(seen.depth)[i]
+        phrases, depth = task.phrases(task.words(int(one.variation)))[0], np.asarray(seen.picture.depth)[i]
         sightings = [
             locate(Sighting(phrase, mask), depth, one.camera) for phrase, mask in zip(phrases, masks[i], strict=True)
         ]
@@ -107,7 +107,7 @@ def measure(name: str, options: Options) -> tuple[list[float], int, list[float]]
             to_own.append(float(np.linalg.norm(sightings[0].point - own[i, 0, 0])))
         if options.out:
             options.out.mkdir(parents=True, exist_ok=True)
-            picture = draw_sightings(np.asarray(seen.rgb)[i], sightings)
+            picture = draw_sightings(np.asarray(seen.picture.rgb)[i], sightings)
             write_picture(options.out / f"{name}-{i}.png", picture)
     return errors, solids, to_own
 

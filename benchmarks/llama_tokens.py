@@ -108,17 +108,17 @@ def main(options: Options) -> int:
         tokenizer = load_tokenizer(folder)
     wrong = 0
     for (style, integers, prompt, answer), encoded in zip(found, dump["encoded"], strict=True):
-        tokens, mask, answered = encode_text(tokenizer, prompt, answer, 2 * LONGEST)
-        wrong += tokens[mask].tolist() != [*encoded, tokenizer.eos_id]
+        text, answered = encode_text(tokenizer, prompt, answer, 2 * LONGEST)
+        wrong += text.tokens[text.mask].tolist() != [*encoded, tokenizer.eos_id]
         grammar = build_answer_grammar(tokenizer, len(integers), style)
-        wrong += grammar.tokens(integers) != tokens[answered].tolist()
+        wrong += grammar.tokens(integers) != text.tokens[answered].tolist()
     print(f"{len(found)} prompts with answers: {wrong} differ from {PACKAGE}'s tokens or from the grammar's")
     print(f"digits 0 to 9: {[tokenizer.encode(f'a{digit}')[-1] for digit in range(10)]}")
     wrong += [tokenizer.encode(f"a{digit}")[-1] for digit in range(10)] != DIGITS
     counts: dict[tuple[int, str], list[tuple[int, int]]] = {}
     for style, integers, prompt, answer in found:
-        _, mask, answered = encode_text(tokenizer, prompt, answer, 2 * LONGEST)
-        asked = int(mask.sum() - answered.sum())
+        text, answered = encode_text(tokenizer, prompt, answer, 2 * LONGEST)
+        asked = int(text.mask.sum() - answered.sum())
         counts.setdefault((len(integers), style), []).append((asked, int(answered.sum())))
     for (arms, style), lengths in sorted(counts.items()):
         asked, answered = (f"{min(column)} to {max(column)}" for column in zip(*lengths, strict=True))

@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +72,7 @@ def ours(folder: Path, frames: int, passes: int = 1) -> dict:
     config = OxeConfig(folder=str(folder), mixture=(NAME,), image_size=SIZE, crop=CROP, streams=1)
     encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64, use_points=False)
     loader = OxeLoader(config, encoding, suite_tokenizer(), batch_size=BATCH, seed=0, progress=False)
-    return measure(iter(loader), frames, passes)
+    return measure((example.picture.rgb for example in loader), frames, passes)
 
 
 def demonstrations(folder: Path, frames: int, passes: int = 1) -> dict:
@@ -86,7 +87,8 @@ def demonstrations(folder: Path, frames: int, passes: int = 1) -> dict:
     data = DataConfig(shift_world=0.05, crop=CROP, state_jitter=0.01, colour_variation=0.2)
     encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64)
     sample = make_sampler(data, encoding, suite_tokenizer())
-    return measure(make_loader(EpisodeReader(folder), sample, batch_size=BATCH, seed=0), frames, passes)
+    loader = make_loader(EpisodeReader(folder), sample, batch_size=BATCH, seed=0)
+    return measure((example.picture.rgb for example in loader), frames, passes)
 
 
 def write_demonstrations(folder: Path, episodes: int, frames: int) -> None:
@@ -148,21 +150,21 @@ def tf_data(folder: Path, frames: int, passes: int = 1) -> dict:
 
     stream = episodes.repeat().flat_map(lambda episode: episode["steps"]).shuffle(2000)
     stream = stream.map(picture, num_parallel_calls=tf.data.AUTOTUNE).batch(BATCH).prefetch(tf.data.AUTOTUNE)
-    return measure(stream.as_numpy_iterator(), frames, passes)
+    return measure((batch["rgb"] for batch in stream.as_numpy_iterator()), frames, passes)
 
 
-def measure(batches, frames: int, passes: int) -> dict:
+def measure(pictures: Iterator[np.ndarray], frames: int, passes: int) -> dict:
     """Frames/s over each of `passes` times `frames`, after a first batch, and the resident memory after each.
 
     work: milliseconds of processor time a frame, which says more than the clock where others use the machine.
     """
-    assert next(batches)["rgb"].shape == (BATCH, SIZE, SIZE, 3)
+    assert next(pictures).shape == (BATCH, SIZE, SIZE, 3)
     speeds, memory = [], []
     worked = time.process_time()
     for _ in range(passes):
         start = time.perf_counter()
         for _ in range(frames // BATCH):
-            next(batches)
+            next(pictures)
         speeds.append(frames // BATCH * BATCH / (time.perf_counter() - start))
         memory.append(int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6)
     work = (time.process_time() - worked) / (passes * (frames // BATCH * BATCH))

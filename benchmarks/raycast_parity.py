@@ -118,7 +118,7 @@ def mujoco_rays(model, data, camera: Camera, size: int) -> tuple[np.ndarray, np.
 def half_pixel_shifted(camera: Camera) -> Camera:
     """The camera whose pixel (u, v) is the ray through (u + 0.5, v + 0.5) of ``camera``: OpenGL's pixel centre."""
     shift = jnp.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], jnp.float32)
-    return camera.replace(intrinsics=camera.intrinsics - shift)
+    return dataclasses.replace(camera, intrinsics=camera.intrinsics - shift)
 
 
 class OpenGLViews:

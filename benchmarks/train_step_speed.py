@@ -22,7 +22,7 @@ from dsvla_jax.command_line import configure_jax, keep_freed_memory
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.types import ModelInputs
+from dsvla_jax.types import ModelInputs, Text
 
 CONFIG = ModelConfig(
     vision=VisionConfig(image_size=224, patch_size=14, width=384, layers=6, heads=6),
@@ -44,8 +44,10 @@ def make_inputs() -> tuple[ModelInputs, jax.Array]:
         image=jnp.asarray(rng.normal(size=(BATCH, size, size, 3)), jnp.float32),
         point_tokens=jnp.asarray(rng.normal(size=(BATCH, POINTS, vision.width)), jnp.float32),
         point_patches=jnp.asarray(rng.integers(0, vision.num_patches, (BATCH, POINTS)), jnp.int32),
-        text_tokens=jnp.asarray(rng.integers(0, CONFIG.language.vocab_size, (BATCH, TEXT)), jnp.int32),
-        text_mask=jnp.ones((BATCH, TEXT), bool),
+        text=Text(
+            jnp.asarray(rng.integers(0, CONFIG.language.vocab_size, (BATCH, TEXT)), jnp.int32),
+            jnp.ones((BATCH, TEXT), bool),
+        ),
     )
     return inputs, jnp.broadcast_to(jnp.arange(TEXT) >= TEXT - ANSWER, (BATCH, TEXT))
 
@@ -64,7 +66,7 @@ class OurStep:
 
             def loss_of(trainable: Any):
                 logits: Any = model.apply(join_variables(trainable, frozen), inputs)
-                losses = optax.softmax_cross_entropy_with_integer_labels(logits[:, :-1], inputs.text_tokens[:, 1:])
+                losses = optax.softmax_cross_entropy_with_integer_labels(logits[:, :-1], inputs.text.tokens[:, 1:])
                 return jnp.where(answer[:, 1:], losses, 0.0).sum() / answer[:, 1:].sum()
 
             loss, gradients = jax.value_and_grad(loss_of)(trainable)

@@ -64,13 +64,13 @@ class SimulatedRobot:
         seen = self.environment.observe(self._state)
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[0], seen)
         observation = {
-            "rgb": one.rgb,
+            "rgb": one.picture.rgb,
             # As in the demonstrations, what is farther than a depth camera sees has no reading.
-            "depth": np.where(one.depth <= MAX_DEPTH, one.depth, 0),
-            "intrinsics": one.camera.intrinsics,
-            "world_from_camera": one.camera.world_from_camera,
-            "pose": one.pose,
-            "gripper_open": one.gripper_open,
+            "depth": np.where(one.picture.depth <= MAX_DEPTH, one.picture.depth, 0),
+            "intrinsics": one.picture.camera.intrinsics,
+            "world_from_camera": one.picture.camera.world_from_camera,
+            "pose": one.robot.pose,
+            "gripper_open": one.robot.gripper_open,
         }
         if self._find is not None:
             points, (problem,) = self._find(self._state, seen)

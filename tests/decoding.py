@@ -13,7 +13,7 @@ from dsvla_jax.encoding.grammar import AnswerGrammar, NumberSlot
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, make_decoder
 from dsvla_jax.model.vla import VLA
-from dsvla_jax.types import ModelInputs
+from dsvla_jax.types import ModelInputs, Text
 
 SPACE, MINUS, DIGIT, WORD, END = 4, 5, 10, 20, 3
 
@@ -63,16 +63,16 @@ def check_against_the_full_forward_pass(
     decoded = decoder(config, grammar)(variables, prompts)
     forward = jax.jit(VLA(config).apply)
     most = max(len(slot.tokens) for slot in grammar.slots)
-    longest = prompts.text_tokens.shape[1] + sum(map(len, grammar.templates)) + 4 * len(grammar.slots)
-    for b, prompt_length in enumerate(np.asarray(prompts.text_mask.sum(axis=1))):
-        text = [*np.asarray(prompts.text_tokens[b, :prompt_length]), *grammar.templates[0]]
+    longest = prompts.text.tokens.shape[1] + sum(map(len, grammar.templates)) + 4 * len(grammar.slots)
+    for b, prompt_length in enumerate(np.asarray(prompts.text.mask.sum(axis=1))):
+        text = [*np.asarray(prompts.text.tokens[b, :prompt_length]), *grammar.templates[0]]
         chosen: list[int] = []
         for k, slot in enumerate(grammar.slots):
             rows = np.zeros((most, longest), np.int32)
             for row, tokens in zip(rows, slot.tokens, strict=False):
                 row[: len(text) + len(tokens)] = [*text, *tokens]
             one = jax.tree.map(lambda x, b=b: jnp.repeat(x[b : b + 1], most, axis=0), prompts)
-            one = dataclasses.replace(one, text_tokens=jnp.asarray(rows), text_mask=jnp.ones(rows.shape, bool))
+            one = dataclasses.replace(one, text=Text(jnp.asarray(rows), jnp.ones(rows.shape, bool)))
             logits: Any = np.asarray(forward(variables, one), np.float64)[:, len(text) - 1 :]
             log_probs = np.array([log_probability(slot, tokens, logits[i]) for i, tokens in enumerate(slot.tokens)])
             np.testing.assert_allclose(np.exp(log_probs).sum(), 1, rtol=1e-4)
@@ -115,14 +115,13 @@ def check_padding_and_batch_mates(
     together = decode(variables, prompts)
     for b, length in list(enumerate(lengths))[-1:]:
         alone = jax.tree.map(lambda x, b=b: x[b : b + 1], prompts)
-        alone = dataclasses.replace(
-            alone, text_tokens=alone.text_tokens[:, :length], text_mask=alone.text_mask[:, :length]
-        )
+        alone = dataclasses.replace(alone, text=jax.tree.map(lambda x, length=length: x[:, :length], alone.text))
         lonely = decode(variables, alone)
         np.testing.assert_array_equal(lonely.integers[0], together.integers[b])
         np.testing.assert_allclose(lonely.log_probs[0], together.log_probs[b], atol=1e-4)
     # What stands in the padding is never read.
-    scribbled = dataclasses.replace(prompts, text_tokens=jnp.where(prompts.text_mask, prompts.text_tokens, 3))
+    text = prompts.text
+    scribbled = dataclasses.replace(prompts, text=Text(jnp.where(text.mask, text.tokens, 3), text.mask))
     np.testing.assert_array_equal(decode(variables, scribbled).log_probs, together.log_probs)
     # Other batch-mates, same shapes: the very same numbers.
     others = decode(variables, jax.tree.map(lambda x, y: x.at[1:].set(y[1:]), prompts, strangers))

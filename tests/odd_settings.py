@@ -14,8 +14,8 @@ from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.experiment import Experiment, ValidationConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig, RopeScaling, VisualPromptConfig
+from tests.random_data import random_episode
 from tests.small import small_encoding, small_language, small_vision
-from tests.test_data import random_episode
 
 # Zero, negative, and huge: beyond what an array can have, and what no machine has the memory for.
 WHOLE = (0, -1, 10**6, 10**12)

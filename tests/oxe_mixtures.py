@@ -66,5 +66,5 @@ def truth_of(name, where):
 
 
 def answer_of(batch, row, arms):
-    tokens = batch["text_tokens"][row][batch["answer_mask"][row]][:-1]
+    tokens = batch.text.tokens[row][batch.answer_mask[row]][:-1]
     return parse_answer(suite_tokenizer().decode([int(token) for token in tokens]), arms, "compact")

@@ -31,6 +31,8 @@ from dsvla_jax.training.loop import arrays_of, state_of
 from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
+from dsvla_jax.types import Example, HeldOutExample
+from tests.random_data import random_example
 from tests.small import small_encoding, small_language, small_vision
 
 VOCABULARY = 40
@@ -60,25 +62,17 @@ def tiny_experiment(fusion: Any = "prefix", points: bool = True, **changes: Any)
     return dataclasses.replace(experiment, **changes)
 
 
-def batches(experiment: Experiment) -> list[dict[str, np.ndarray]]:
+def batches(experiment: Experiment) -> list[Example[np.ndarray]]:
     """Three batches of noise, whose answers have different lengths, so that no mean over parts is right by chance."""
     rng = np.random.default_rng(0)
-    size, image, text = experiment.batch_size, 32, experiment.encoding.max_text_length
-    intrinsics = np.array([[-40, 0, 16], [0, -40, 16], [0, 0, 1]], np.float32)
+    size, text = experiment.batch_size, experiment.encoding.max_text_length
 
-    def batch() -> dict[str, np.ndarray]:
+    def batch() -> Example[np.ndarray]:
         place, length = np.arange(text), rng.integers(1, 8, (size, 1))
         answer = (place >= 8) & (place < 8 + length)
-        return {
-            "rgb": rng.integers(0, 255, (size, image, image, 3), np.uint8),
-            "depth": rng.uniform(0.8, 1.2, (size, image, image)).astype(np.float32),
-            "intrinsics": np.broadcast_to(intrinsics, (size, 3, 3)),
-            "world_from_camera": np.broadcast_to(np.eye(4, dtype=np.float32), (size, 4, 4)),
-            "text_tokens": rng.integers(4, VOCABULARY, (size, text)).astype(np.int32),
-            "text_mask": np.ones((size, text), bool),
-            "answer_mask": answer,
-            "number_rows": np.where(answer & (rng.random((size, text)) < 0.5), 1, 0).astype(np.int32),
-        }
+        example = random_example(rng, answer, VOCABULARY)
+        rows = np.where(answer & (rng.random((size, text)) < 0.5), 1, 0).astype(np.int32)
+        return dataclasses.replace(example, number_rows=rows)
 
     return [batch() for _ in range(3)]
 
@@ -93,11 +87,11 @@ def digest(tree: Any) -> str:
     return hashlib.sha256(b"".join(map(whole, jax.tree.leaves(tree)))).hexdigest()
 
 
-def validation_batch(batch: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def validation_batch(batch: Example[np.ndarray]) -> HeldOutExample[np.ndarray]:
     """The batch as if all its choices belonged to the first number of an answer, which is 2."""
-    integers = np.zeros((len(batch["rgb"]), 2, 8), np.int32)
+    integers = np.zeros((len(batch.number_rows), 2, 8), np.int32)
     integers[:, 0, 0] = 2
-    return {**batch, "integers": integers, "number_of": np.where(batch["number_rows"] > 0, 1, 0).astype(np.int32)}
+    return HeldOutExample(batch, integers, np.where(batch.number_rows > 0, 1, 0).astype(np.int32))
 
 
 def train(experiment: Experiment, devices: int, run: Path | None, until: int, validates: bool) -> list[float]:
@@ -109,7 +103,7 @@ def train(experiment: Experiment, devices: int, run: Path | None, until: int, va
     step = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, TARGETS), state, mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     mine = slice(part.index * part.size, (part.index + 1) * part.size)
-    parts = [{key: value[mine] for key, value in batch.items()} for batch in batches(experiment)]
+    parts = [jax.tree.map(lambda leaf: leaf[mine], batch) for batch in batches(experiment)]
     data = [put_batch(batch, mesh) for batch in parts]
     new = run is not None and not (run / "checkpoints").exists()
     if run is not None and not new:

@@ -36,7 +36,7 @@ from dsvla_jax.sim.scene import build_scene
 from dsvla_jax.sim.shifts import SHIFTS, Start, shift
 from dsvla_jax.sim.tasks import get_task
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
-from dsvla_jax.types import Observation
+from dsvla_jax.types import Picture
 from tests.accelerator_sections import platforms_expert, sections
 from tests.small import small_encoding
 from tests.vocabularies import small_tokenizer
@@ -274,9 +274,7 @@ def test_geometry_asks_accelerators_for_whole_float32_products():
         scene.initial, camera, jnp.ones(3), jnp.asarray(scene.mj_model.geom_size), jnp.asarray(scene.mj_model.geom_pos)
     )
     batch = jax.tree.map(lambda x: x[None], camera)
-    seen = Observation(
-        jnp.zeros((1, 32, 32, 3), jnp.uint8), jnp.ones((1, 32, 32)), batch, pose[None, None], jnp.ones((1, 1))
-    )
+    seen = Picture(jnp.zeros((1, 32, 32, 3), jnp.uint8), jnp.ones((1, 32, 32)), batch)
     found = {
         "shifts": products(lambda key, start: shift(scene, key, start), jax.random.key(0), start),
         "kinematics": products(

@@ -1,13 +1,20 @@
 """Random variations of a frame keep it true: what moves, moves along with its camera, and the rest stays."""
 
 import copy
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from data_pipelines import augment
-from data_pipelines.records import Frame, decode_frame
-from tests.test_data import random_episode
+from data_pipelines.records import decode_frame
+from dsvla_jax.types import named_arrays
+from tests.random_data import random_episode
+
+
+def arrays_of(frame):
+    """All fields of a frame, and those of their fields, by name."""
+    return named_arrays({field.name: getattr(frame, field.name) for field in fields(frame)})
 
 
 def project(points, frame):
@@ -22,11 +29,10 @@ def test_shift_world_keeps_every_pixel():
     frame = decode_frame(random_episode(0), 1)
     offset = augment.random_offset(rng, (0.3, 0.3, 0.1))
     shifted = augment.shift_world(frame, offset)
-    for field in ("pose", "target_pose", "keypoint"):
-        np.testing.assert_allclose(
-            project(shifted[field][0, :3], shifted), project(frame[field][0, :3], frame), atol=1e-3
-        )
-        np.testing.assert_allclose(shifted[field][0, :3] - frame[field][0, :3], offset, atol=1e-6)
+    for field in ("robot.pose", "target.pose", "keypoint"):
+        moved, old = arrays_of(shifted)[field], arrays_of(frame)[field]
+        np.testing.assert_allclose(project(moved[0, :3], shifted), project(old[0, :3], frame), atol=1e-3)
+        np.testing.assert_allclose(moved[0, :3] - old[0, :3], offset, atol=1e-6)
     np.testing.assert_array_equal(shifted.robot.pose[:, 3:], frame.robot.pose[:, 3:])
     assert shifted.picture.rgb is frame.picture.rgb
 
@@ -37,7 +43,7 @@ def smooth_frame(size=64):
     v, u = np.mgrid[:size, :size]
     depth = (1 + 0.002 * u + 0.004 * v).astype(np.float32)
     rgb = np.stack([3 * u, 3 * v, np.full_like(u, 90)], -1).astype(np.uint8)
-    return Frame(**{**frame, "rgb": rgb, "depth": depth})
+    return replace(frame, picture=replace(frame.picture, rgb=rgb, depth=depth))
 
 
 def world_points(frame):
@@ -52,8 +58,8 @@ def test_a_crop_keeps_every_point_at_its_place():
     for seed in range(20):
         cropped = augment.random_crop(frame, np.random.default_rng(seed), 0.4)
         assert cropped.picture.depth.shape == (64, 64)
-        for name in ("world_from_camera", "pose", "target_pose", "keypoint"):
-            np.testing.assert_array_equal(cropped[name], frame[name])
+        for name in ("picture.camera.world_from_camera", "robot.pose", "target.pose", "keypoint"):
+            np.testing.assert_array_equal(arrays_of(cropped)[name], arrays_of(frame)[name])
         # Where the original camera sees each point of the cropped cloud, its picture has the same colour and depth.
         for v in range(0, 64, 7):
             for u in range(0, 64, 7):
@@ -61,7 +67,7 @@ def test_a_crop_keeps_every_point_at_its_place():
                 np.testing.assert_allclose(cropped.picture.rgb[v, u, :2], [3 * x, 3 * y], atol=1.1)
                 assert abs(cropped.picture.depth[v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
     assert (
-        augment.random_crop(frame, np.random.default_rng(0), 1.0)["intrinsics"].tolist()
+        augment.random_crop(frame, np.random.default_rng(0), 1.0).picture.camera.intrinsics.tolist()
         == frame.picture.camera.intrinsics.tolist()
     )
 
@@ -86,20 +92,20 @@ def test_offsets_are_whole_centimetres():
 
 def test_noise_changes_what_it_says_and_nothing_else():
     frame = decode_frame(random_episode(0), 0)
-    before = {name: copy.deepcopy(value) for name, value in frame.items()}
+    before = copy.deepcopy(arrays_of(frame))
     variations = {
-        "pose": lambda rng: augment.jitter_state(frame, rng, 0.02, 1.0),
+        "robot.pose": lambda rng: augment.jitter_state(frame, rng, 0.02, 1.0),
         "keypoint": lambda rng: augment.perturb_keypoint(frame, rng, 0.03, 1.0),
-        "rgb": lambda rng: augment.vary_colour(frame, rng),
+        "picture.rgb": lambda rng: augment.vary_colour(frame, rng),
     }
     for changed, vary in variations.items():
-        result = vary(np.random.default_rng(1))
-        again = vary(np.random.default_rng(1))
-        for name in frame:
-            np.testing.assert_array_equal(frame[name], before[name])
+        result = arrays_of(vary(np.random.default_rng(1)))
+        again = arrays_of(vary(np.random.default_rng(1)))
+        for name, value in arrays_of(frame).items():
+            np.testing.assert_array_equal(value, before[name])
             np.testing.assert_array_equal(result[name], again[name])
-            assert np.array_equal(result[name], frame[name]) == (name != changed)
-    moved = variations["keypoint"](np.random.default_rng(2))["keypoint"] - frame.keypoint
+            assert np.array_equal(result[name], value) == (name != changed)
+    moved = variations["keypoint"](np.random.default_rng(2)).keypoint - frame.keypoint
     assert 0 < np.abs(moved).max() <= 0.03 + 1e-6
     assert augment.perturb_keypoint(frame, np.random.default_rng(0), 0.03, 0.0) is frame
-    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0)["rgb"], frame.picture.rgb)
+    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0).picture.rgb, frame.picture.rgb)

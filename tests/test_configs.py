@@ -24,6 +24,7 @@ from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.state import make_optimizer, make_train_step, model_inputs, start_state
+from dsvla_jax.types import Action, Example, Picture, RobotState
 
 # row: (3D spatial constraint, 3D tokens, aligned positional embeddings)
 ROWS = {
@@ -35,22 +36,20 @@ ROWS = {
 
 
 def frame(arms: int, rng: np.random.Generator) -> Frame:
-    camera = jax.tree.map(np.asarray, front_camera(96))
     down = np.array([0, 1, 0, 0], np.float32)
 
     def pose() -> np.ndarray:
         return np.concatenate([rng.uniform([0, -0.3, 0.8], [0.4, 0.3, 1.2], (arms, 3)), [down] * arms], 1)
 
     return Frame(
-        rgb=rng.integers(0, 255, (96, 96, 3), np.uint8),
-        depth=rng.uniform(1.0, 1.3, (96, 96)).astype(np.float32),
-        intrinsics=camera.intrinsics,
-        world_from_camera=camera.world_from_camera,
-        pose=pose().astype(np.float32),
-        gripper_open=np.ones(arms, np.float32),
+        picture=Picture(
+            rng.integers(0, 255, (96, 96, 3), np.uint8),
+            rng.uniform(1.0, 1.3, (96, 96)).astype(np.float32),
+            jax.tree.map(np.asarray, front_camera(96)),
+        ),
+        robot=RobotState(pose().astype(np.float32), np.ones(arms, np.float32)),
         keypoint=pose()[:, :3].astype(np.float32),
-        target_pose=pose().astype(np.float32),
-        target_gripper=np.zeros(arms, np.float32),
+        target=Action(pose().astype(np.float32), np.zeros(arms, np.float32)),
         instruction="turn on the light",
         task="lamp_on",
         task_index=0,
@@ -70,10 +69,10 @@ def small(name: str) -> Experiment:
     return replace(experiment, model=model, batch_size=4, steps=8)
 
 
-def batch_of(experiment: Experiment) -> dict[str, np.ndarray]:
+def batch_of(experiment: Experiment) -> Example[np.ndarray]:
     sample = make_sampler(experiment.data, experiment.encoding, suite_tokenizer())
     samples = [sample(frame(1 + i % 2, np.random.default_rng(i)), np.random.default_rng(i)) for i in range(4)]
-    return {key: np.stack([one[key] for one in samples]) for key in samples[0]}
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
 
 
 @pytest.mark.parametrize("name", ROWS)
@@ -100,8 +99,8 @@ def test_row_is_what_the_table_says(name: str, row: tuple[bool, bool, bool]):
     experiment = get_config(name)
     batch = batch_of(experiment)
     near = suite_tokenizer().encode("near")[0]
-    assert (batch["text_tokens"] == near).any(axis=1).all() == constraint
-    inputs = model_inputs({key: jnp.asarray(value) for key, value in batch.items()}, experiment.encoding)
+    assert (batch.text.tokens == near).any(axis=1).all() == constraint
+    inputs = model_inputs(*jax.tree.map(jnp.asarray, (batch.picture, batch.text)), experiment.encoding)
     tokens = inputs.point_tokens.shape[1]
     assert tokens == (experiment.model.vision.num_patches if points else 0)
     in_order = (np.asarray(inputs.point_patches) == np.arange(tokens)).all()
@@ -167,8 +166,9 @@ def test_every_instruction_of_the_suite_fits_the_tiny_text():
     encoding, tokenizer = get_config("tiny").encoding, suite_tokenizer()
     for task in TASKS.values():
         pose = np.tile(np.array([0.2, 0.1, 0.9, 0, 1, 0, 0], np.float32), (task.num_arms, 1))
-        gripper, keypoint = np.ones(task.num_arms, np.float32), np.zeros((task.num_arms, 3), np.float32)
-        answer = format_answer(np.asarray(encoding.codec.encode(pose, gripper)), encoding.style)
+        robot = RobotState(pose, np.ones(task.num_arms, np.float32))
+        keypoint = np.zeros((task.num_arms, 3), np.float32)
+        answer = format_answer(np.asarray(encoding.codec.encode(pose, robot.gripper_open)), encoding.style)
         for text in task.all_instructions():
-            prompt = build_prompt(encoding, text, pose, gripper, keypoint)
+            prompt = build_prompt(encoding, text, robot, keypoint)
             encode_text(tokenizer, prompt, answer, encoding.max_text_length)

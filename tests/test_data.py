@@ -20,7 +20,6 @@ from data_pipelines.records import (
     decode_rgb,
     encode_depth,
     encode_rgb,
-    make_episode,
     mark_missing,
     pack_episode,
     unpack_episode,
@@ -30,28 +29,7 @@ from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action, Camera
-
-
-def random_episode(seed, task="lamp_on", arms=1, frames=3, size=8):
-    rng = np.random.default_rng(seed)
-    camera = np.eye(4)
-    camera[:3, :3] = [[0, -0.42262, -0.90631], [-1, 0, 0], [0, 0.90631, -0.42262]]
-    camera[:3, 3] = 1.35, 0, 1.58
-    return make_episode(
-        task=task,
-        instruction=f"do {task} number {seed}",
-        seed=seed,
-        rgb=rng.integers(0, 256, (frames, size, size, 3), np.uint8),
-        depth=rng.uniform(0.5, 3, (frames, size, size)),
-        intrinsics=[[-100, 0, size / 2], [0, -100, size / 2], [0, 0, 1]],
-        world_from_camera=camera,
-        pose=rng.uniform(-1, 1, (frames, arms, 7)),
-        gripper_open=rng.integers(0, 2, (frames, arms)),
-        target_pose=rng.uniform(-1, 1, (frames, arms, 7)),
-        target_gripper=rng.integers(0, 2, (frames, arms)),
-        keypoints=rng.uniform(-1, 1, (arms, 2, 3)),
-        active_keypoint=rng.uniform(-1, 1, (frames, arms, 3)),
-    )
+from tests.random_data import random_episode
 
 
 @pytest.fixture
@@ -116,7 +94,7 @@ def test_reader_numbers_all_episodes_and_frames(folder):
     assert len(EpisodeReader(folder, episodes=4)) == 4
     with pytest.raises(DataError, match="episodes of lamp_on: expected at least 8, got 7; run"):
         EpisodeReader(folder, episodes=8)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).frame(2)["rgb"], reader.frame(2)["rgb"])
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).frame(2).picture.rgb, reader.frame(2).picture.rgb)
 
 
 def test_writing_twice_gives_the_same_bytes(folder, tmp_path_factory):
@@ -153,6 +131,11 @@ def test_damaged_folders_are_refused(folder):
         EpisodeReader(folder)
 
 
+def place(frame, rng):
+    """A sample that says where in the demonstrations it is from."""
+    return {"episode": np.array(frame.episode), "frame": np.array(frame.frame)}
+
+
 def identities(batches):
     return [(int(e), int(f)) for batch in batches for e, f in zip(batch["episode"], batch["frame"], strict=True)]
 
@@ -161,33 +144,38 @@ def test_an_epoch_is_every_frame_once_in_a_new_order(folder):
     reader = EpisodeReader(folder)
     count = reader.num_frames
     stream = identities(
-        batch for batch, _ in zip(make_loader(reader, batch_size=1, seed=3), range(2 * count), strict=False)
+        batch for batch, _ in zip(make_loader(reader, place, batch_size=1, seed=3), range(2 * count), strict=False)
     )
     everything = [reader.locate(number) for number in range(count)]
     first, second = stream[:count], stream[count:]
     assert sorted(first) == sorted(second) == everything
     assert first != everything
     assert first != second
-    other = identities(batch for batch, _ in zip(make_loader(reader, batch_size=1, seed=4), range(count), strict=False))
+    other = identities(
+        batch for batch, _ in zip(make_loader(reader, place, batch_size=1, seed=4), range(count), strict=False)
+    )
     assert other != first
-    assert identities(make_loader(reader, batch_size=1, seed=3, shuffle=False, num_epochs=1)) == everything
+    assert identities(make_loader(reader, place, batch_size=1, seed=3, shuffle=False, num_epochs=1)) == everything
 
 
 def test_batches_have_stacked_fields(folder):
-    batch = next(make_loader(EpisodeReader(folder), batch_size=4, seed=0))
-    shapes = {name: (value.shape, value.dtype) for name, value in batch.items()}
-    assert shapes["rgb"] == ((4, 8, 8, 3), np.uint8)
-    assert shapes["depth"] == ((4, 8, 8), np.float32)
-    assert shapes["world_from_camera"] == ((4, 4, 4), np.float32)
-    assert shapes["pose"] == shapes["target_pose"] == ((4, 1, 7), np.float32)
-    assert shapes["keypoint"] == ((4, 1, 3), np.float32)
-    assert [str(text)[:10] for text in batch["instruction"]] == ["do lamp_on"] * 4
+    def sample(frame, rng):
+        return frame.picture, frame.robot, frame.target, frame.keypoint, np.array(frame.instruction)
+
+    batch = next(make_loader(EpisodeReader(folder), sample, batch_size=4, seed=0))
+    picture, robot, target, keypoint = jax.tree.map(lambda value: (value.shape, value.dtype), batch[:4])
+    assert picture.rgb == ((4, 8, 8, 3), np.uint8)
+    assert picture.depth == ((4, 8, 8), np.float32)
+    assert picture.camera.world_from_camera == ((4, 4, 4), np.float32)
+    assert robot.pose == target.pose == ((4, 1, 7), np.float32)
+    assert keypoint == ((4, 1, 3), np.float32)
+    assert [str(text)[:10] for text in batch[4]] == ["do lamp_on"] * 4
 
 
 def test_resumed_iterator_continues_exactly(folder):
     def sample(frame, rng):
         frame = augment.perturb_keypoint(frame, rng, 0.03, 0.5)
-        return {name: frame[name] for name in ("rgb", "keypoint", "episode", "frame")}
+        return {"rgb": frame.picture.rgb, "keypoint": frame.keypoint, **place(frame, rng)}
 
     iterator = make_loader(EpisodeReader(folder), sample, batch_size=4, seed=1)
     for _ in range(6):
@@ -201,7 +189,7 @@ def test_resumed_iterator_continues_exactly(folder):
 
 
 def position_after(folder, batches=3, **choice):
-    iterator = make_loader(EpisodeReader(folder, **choice), batch_size=4, seed=1)
+    iterator = make_loader(EpisodeReader(folder, **choice), place, batch_size=4, seed=1)
     for _ in range(batches):
         next(iterator)
     return json.loads(json.dumps(iterator.get_state()))
@@ -219,9 +207,9 @@ def test_a_position_is_refused_in_other_demonstrations(folder, tmp_path_factory)
         match=r"grown.*: expected lamp_on 7 episodes \(16 frames\) as at the saved position, got lamp_on 8 episodes"
         r" \(18 frames\); .* start a new run with these",
     ):
-        make_loader(EpisodeReader(grown), batch_size=4, seed=1).set_state(state)
+        make_loader(EpisodeReader(grown), place, batch_size=4, seed=1).set_state(state)
     with pytest.raises(DataError, match=r"other.*: expected those of the saved position, got as many others"):
-        make_loader(EpisodeReader(other), batch_size=4, seed=1).set_state(state)
+        make_loader(EpisodeReader(other), place, batch_size=4, seed=1).set_state(state)
 
 
 def test_a_position_outlives_growth_by_episodes_that_are_not_used(tmp_path):
@@ -234,13 +222,13 @@ def test_a_position_outlives_growth_by_episodes_that_are_not_used(tmp_path):
 
 
 def resumed(folder, state, **choice):
-    iterator = make_loader(EpisodeReader(folder, **choice), batch_size=4, seed=1)
+    iterator = make_loader(EpisodeReader(folder, **choice), place, batch_size=4, seed=1)
     iterator.set_state(state)
     return iterator
 
 
 def test_positions_of_earlier_versions_are_still_taken(folder):
-    iterator = make_loader(EpisodeReader(folder), batch_size=4, seed=1)
+    iterator = make_loader(EpisodeReader(folder), place, batch_size=4, seed=1)
     for _ in range(4):
         batch = next(iterator)
     # What was saved before the demonstrations were noted beside the number, and before an index held digests.
@@ -258,7 +246,8 @@ def test_processes_share_the_samples_out(folder):
 
     def stream(count, **split):
         return identities(
-            batch for batch, _ in zip(make_loader(reader, batch_size=1, seed=5, **split), range(count), strict=False)
+            batch
+            for batch, _ in zip(make_loader(reader, place, batch_size=1, seed=5, **split), range(count), strict=False)
         )
 
     whole = stream(20)
@@ -271,7 +260,7 @@ def test_processes_cut_the_same_batches_and_take_over_from_each_other(folder):
     """A batch of 4 is the same one whether 1, 2 or 4 processes share it, and a position is good for any of them."""
 
     def sample(frame, rng):
-        return {"keypoint": augment.perturb_keypoint(frame, rng, 0.03, 0.5)["keypoint"], "frame": frame.frame}
+        return {"keypoint": augment.perturb_keypoint(frame, rng, 0.03, 0.5).keypoint, "frame": np.array(frame.frame)}
 
     def loaders(count):
         split = [{"process_index": i, "process_count": count} for i in range(count)]
@@ -295,14 +284,12 @@ def test_processes_cut_the_same_batches_and_take_over_from_each_other(folder):
         position = json.loads(json.dumps(states[0]))
 
 
-def test_mixed_arms_need_a_text_sample(tmp_path):
+def test_a_sample_of_equal_shapes_mixes_tasks_of_one_and_two_arms(tmp_path):
     write_episodes(tmp_path, [random_episode(0), random_episode(1, task="push_box", arms=2)])
     reader = EpisodeReader(tmp_path)
-    with pytest.raises(ValueError, match="pass `to_sample`"):
-        make_loader(reader, batch_size=2, seed=0)
 
     def sample(frame, rng):
-        return {"rgb": frame.picture.rgb, "task": frame.task_index}
+        return {"rgb": frame.picture.rgb, "task": np.array(frame.task_index)}
 
     batch = next(make_loader(reader, sample, batch_size=6, seed=0))
     assert sorted(batch["task"]) == [0, 0, 0, 1, 1, 1]
@@ -439,9 +426,9 @@ def test_recorded_expert_succeeds_again_from_its_seed(tmp_path):
     first = environment.observe(state)
     for i in range(2):
         frame = decode_frame(reader.episode(i), 0)
-        np.testing.assert_array_equal(frame.picture.rgb, first.rgb[i])
+        np.testing.assert_array_equal(frame.picture.rgb, first.picture.rgb[i])
         # The format keeps tenths of a millimetre.
-        np.testing.assert_allclose(frame.picture.depth, mark_missing(np.asarray(first.depth[i])), atol=1e-4)
+        np.testing.assert_allclose(frame.picture.depth, mark_missing(np.asarray(first.picture.depth[i])), atol=1e-4)
     for m in range(episode.num_frames):
         both = [reader.episode(i) for i in range(2)]
         pose = jnp.stack([x.target_pose[m] for x in both])

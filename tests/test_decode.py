@@ -13,7 +13,7 @@ from dsvla_jax.encoding.prompts import format_answer, parse_answer
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.decode import Decoding, decode_actions, make_decoder
 from dsvla_jax.model.layers_apart import put_together, take_apart
-from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.model.vla import VLA, extend, initialize, lm_head, prefill
 from dsvla_jax.types import ModelInputs
 from tests.decoding import (
     check_against_the_full_forward_pass,
@@ -22,6 +22,7 @@ from tests.decoding import (
     small_grammar,
     whole_number_grammar,
 )
+from tests.random_data import random_inputs
 from tests.vocabularies import small_tokenizer
 
 VOCAB = 40
@@ -35,15 +36,7 @@ PROMPT_LENGTHS = np.array([9, 4, 1])
 
 
 def make_prompts(lengths=PROMPT_LENGTHS, padded=9, seed=0) -> ModelInputs:
-    rng = np.random.default_rng(seed)
-    batch = len(lengths)
-    return ModelInputs(
-        image=jnp.asarray(rng.normal(size=(batch, 16, 16, 3)), jnp.float32),
-        point_tokens=jnp.asarray(rng.normal(size=(batch, 3, 32)), jnp.float32),
-        point_patches=jnp.asarray(rng.integers(0, 4, (batch, 3)), jnp.int32),
-        text_tokens=jnp.asarray(rng.integers(10, VOCAB, (batch, padded)), jnp.int32),
-        text_mask=jnp.arange(padded)[None] < jnp.asarray(lengths)[:, None],
-    )
+    return random_inputs(CONFIG.vision, range(10, VOCAB), lengths, padded, points=3, seed=seed)
 
 
 def random_variables(config: ModelConfig):
@@ -79,18 +72,18 @@ def test_decoding_is_the_best_choice_of_the_full_forward_pass(variables):
 def test_prefill_and_extend_give_the_logits_of_the_full_forward_pass(variables):
     model, prompts = VLA(CONFIG), make_prompts(np.array([9, 9]))
     full = jax.jit(model.apply)(variables, prompts)
-    extend = jax.jit(lambda *args: model.apply(variables, *args, method="extend"))
-    logits = jax.jit(lambda *args: model.apply(variables, *args, method="lm_head"))
-    head = dataclasses.replace(prompts, text_tokens=prompts.text_tokens[:, :4], text_mask=prompts.text_mask[:, :4])
-    hidden, cache = jax.jit(lambda head: model.apply(variables, head, 5, method="prefill"))(head)
+    extended = jax.jit(lambda *args: extend(model, variables, *args))
+    logits = jax.jit(lambda *args: lm_head(model, variables, *args))
+    head = dataclasses.replace(prompts, text=jax.tree.map(lambda x: x[:, :4], prompts.text))
+    hidden, cache = jax.jit(lambda head: prefill(model, variables, head, 5))(head)
     np.testing.assert_allclose(logits(hidden), full[:, 3], atol=1e-4)
     slots = cache.keys.shape[3]
     start = slots - 5
     for first, count in ((4, 2), (6, 1), (7, 1)):
         positions = start - 4 + first + jnp.arange(count)[None].repeat(2, axis=0)
         mask = jnp.arange(slots) <= positions[..., None]
-        chunk = prompts.text_tokens[:, first : first + count]
-        hidden, cache = extend(chunk, positions, mask, cache, start - 4 + first)
+        chunk = prompts.text.tokens[:, first : first + count]
+        hidden, cache = extended(chunk, positions, mask, cache, start - 4 + first)
         np.testing.assert_allclose(logits(hidden), full[:, first : first + count], atol=1e-4)
     some = np.array([3, 17, 5])
     np.testing.assert_allclose(logits(hidden, some), full[:, 7:8, some], atol=1e-4)

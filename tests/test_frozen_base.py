@@ -140,7 +140,8 @@ def test_a_model_with_eight_bit_kernels_is_the_model_with_their_values():
     experiment = dataclasses.replace(small_experiment(regime="lora"), model=model)
     variables = initialize(model, jax.random.key(0))
     full = {**variables, "params": dequantize(variables["params"])}
-    inputs = model_inputs({k: jnp.asarray(v) for k, v in random_batch(experiment).items()}, experiment.encoding)
+    batch = random_batch(experiment)
+    inputs = model_inputs(*jax.tree.map(jnp.asarray, (batch.picture, batch.text)), experiment.encoding)
 
     @jax.jit
     def run(params, lora):
@@ -204,7 +205,7 @@ def test_bfloat16_where_it_is_safe_and_float32_where_it_matters(fusion):
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state, frozen = jax.eval_shape(lambda: initial_state(experiment, VALUES, optimizer))
     step = make_train_step(experiment, VLA(model), optimizer, NO_NUMBERS)
-    batch = {name: jax.ShapeDtypeStruct(value.shape, value.dtype) for name, value in random_batch(experiment).items()}
+    batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, random_batch(experiment)))
     program = list(equations(jax.make_jaxpr(step)(state, frozen, batch).jaxpr))
 
     def dtypes(equation):

@@ -95,10 +95,10 @@ def test_pictures_prompts_and_answers_are_those_of_training(folder, tmp_path, ta
     loader = OxeLoader(config, ENCODING, suite_tokenizer(), batch_size=200, seed=0, num_threads=0, progress=False)
     batch, tokenizer, seen = next(loader), suite_tokenizer(), {}
     for row, (tokens, mask, answer) in enumerate(
-        zip(batch["text_tokens"], batch["text_mask"], batch["answer_mask"], strict=True)
+        zip(batch.text.tokens, batch.text.mask, batch.answer_mask, strict=True)
     ):
         prompt = tokenizer.decode([int(token) for token in tokens[mask & ~answer]][1:])
-        seen[prompt, tokenizer.decode([int(token) for token in tokens[answer]][:-1])] = batch["rgb"][row]
+        seen[prompt, tokenizer.decode([int(token) for token in tokens[answer]][:-1])] = batch.picture.rgb[row]
     lines = [
         tokenizer.decode(tokenizer.encode(line.strip()))
         for block in re.findall(r"<pre>(.*?)</pre>", text, re.S)

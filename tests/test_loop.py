@@ -22,6 +22,7 @@ from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training import loop
 from dsvla_jax.training.metrics import MetricsWriter, rewind
 from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step, start_state
+from dsvla_jax.types import Example, named_arrays
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
 
 SMALL = small_experiment(log_every=1, checkpoint_every=3, seed=1)
@@ -52,11 +53,12 @@ def start() -> TrainState:
 def make_stream(bad: Collection[int]):
     """Batches of random samples; those numbered in `bad` have a camera of NaN, as a damaged recording might."""
 
-    def sample(number: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        one = {name: value[0] for name, value in random_batch(EXPERIMENT).items()}
-        one["text_tokens"] = rng.integers(4, VOCABULARY, one["text_tokens"].shape).astype(np.int32)
-        camera = np.nan if number in bad else 1
-        return {**one, "world_from_camera": one["world_from_camera"] * np.float32(camera)}
+    def sample(number: int, rng: np.random.Generator) -> Example[np.ndarray]:
+        one = jax.tree.map(lambda leaf: leaf[0], random_batch(EXPERIMENT))
+        tokens = rng.integers(4, VOCABULARY, one.text.tokens.shape).astype(np.int32)
+        camera = one.picture.camera
+        seen = replace(camera, world_from_camera=camera.world_from_camera * np.float32(np.nan if number in bad else 1))
+        return replace(one, picture=replace(one.picture, camera=seen), text=replace(one.text, tokens=tokens))
 
     data = grain.MapDataset.range(1000).seed(EXPERIMENT.seed).random_map(sample).batch(EXPERIMENT.batch_size)
     return iter(data.to_iter_dataset(grain.ReadOptions(num_threads=0, prefetch_buffer_size=0)))
@@ -178,8 +180,13 @@ def test_a_nan_batch_is_skipped_counted_and_kept(tmp_path: Path):
     (file,) = (tmp_path / "skipped").iterdir()
     assert file.name == "step-00000004.npz"
     with np.load(file, allow_pickle=False) as batch:
-        assert np.isnan(batch["world_from_camera"]).any(axis=(1, 2)).tolist() == [False, False, True, False]
-        assert set(batch) == set(random_batch(EXPERIMENT))
+        assert np.isnan(batch["picture.camera.world_from_camera"]).any(axis=(1, 2)).tolist() == [
+            False,
+            False,
+            True,
+            False,
+        ]
+        assert set(batch) == set(named_arrays(random_batch(EXPERIMENT)))
     assert int(final_state(tmp_path).skipped) == 1
 
 

@@ -15,6 +15,7 @@ from dsvla_jax.model.llama import rotary_tables, rotate
 from dsvla_jax.model.lora import LoraDense, adapted_product, merge_lora, unmerge_lora
 from dsvla_jax.model.vla import VLA, embed_numbers, initialize, number_embeddings
 from dsvla_jax.types import ModelInputs
+from tests.random_data import random_inputs
 
 VOCAB = 60
 LORA = LoraConfig(rank=3, alpha=7.0)
@@ -27,14 +28,7 @@ PATCHES = CONFIG.vision.num_patches
 
 
 def make_inputs(batch=2, points=6, text=8, seed=0) -> ModelInputs:
-    rng = np.random.default_rng(seed)
-    return ModelInputs(
-        image=jnp.asarray(rng.normal(size=(batch, 32, 32, 3)), jnp.float32),
-        point_tokens=jnp.asarray(rng.normal(size=(batch, points, 32)), jnp.float32),
-        point_patches=jnp.asarray(rng.integers(0, PATCHES, (batch, points)), jnp.int32),
-        text_tokens=jnp.asarray(rng.integers(0, VOCAB, (batch, text)), jnp.int32),
-        text_mask=jnp.ones((batch, text), bool),
-    )
+    return random_inputs(CONFIG.vision, range(VOCAB), np.full(batch, text), text, points, seed)
 
 
 def randomise(tree, seed=1, scale=0.2):
@@ -81,7 +75,9 @@ def test_without_3d_tokens(forward, variables):
 
 def test_future_text_does_not_change_earlier_logits(forward, variables):
     inputs = make_inputs()
-    changed = dataclasses.replace(inputs, text_tokens=inputs.text_tokens.at[:, 5:].set(1))
+    changed = dataclasses.replace(
+        inputs, text=dataclasses.replace(inputs.text, tokens=inputs.text.tokens.at[:, 5:].set(1))
+    )
     np.testing.assert_allclose(forward(variables, inputs)[:, :5], forward(variables, changed)[:, :5], atol=1e-6)
     assert np.abs(forward(variables, inputs)[:, 5:] - forward(variables, changed)[:, 5:]).max() > 1e-3
 

@@ -16,7 +16,7 @@ import pytest
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.llama import Llama
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.types import ModelInputs
+from dsvla_jax.types import ModelInputs, Text
 from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
 from dsvla_jax.weights.readers.any_format import read_language, read_vision
 from dsvla_jax.weights.readers.torch_files import list_tensors
@@ -49,8 +49,7 @@ def text_inputs(config: ModelConfig) -> ModelInputs:
         image=jnp.asarray(OUTPUTS["image"]),
         point_tokens=jnp.zeros((1, 0, config.vision.width)),
         point_patches=jnp.zeros((1, 0), jnp.int32),
-        text_tokens=tokens,
-        text_mask=jnp.ones_like(tokens, bool),
+        text=Text(tokens, jnp.ones_like(tokens, bool)),
     )
 
 

@@ -80,8 +80,8 @@ def test_absolute_answers_are_poses_and_prompts_have_no_keypoint(folder):
         end = min([*changes[changes > step], known.num_steps - 1])
         np.testing.assert_allclose(answer.pose[0, :3], arm.position[end], atol=0.00501)
         assert (Rotation.from_quat(answer.pose[0, 3:]) * arm.rotation[end].inv()).magnitude() < 0.03
-        prompt = batch["text_mask"][row] & ~batch["answer_mask"][row]
-        text = suite_tokenizer().decode([int(token) for token in batch["text_tokens"][row][prompt]][1:])
+        prompt = batch.text.mask[row] & ~batch.answer_mask[row]
+        text = suite_tokenizer().decode([int(token) for token in batch.text.tokens[row][prompt]][1:])
         assert text.startswith(known.instruction)
         assert "near" not in text
         state = np.rint(np.append(arm.position[step] * 100, 0)[:3]).astype(int)
@@ -94,7 +94,7 @@ def test_red_and_blue_are_put_right_where_the_copies_are_as_published(tmp_path, 
     write_fixture(tmp_path, name, episodes=9, steps=9)
     loader = make(tmp_path, (name,), streams=1, threads=0, crop=1.0, colour_variation=0.0, colours_mended=mended)
     places = [loader.source[i] for i in range(4)]
-    for rgb, place in zip(next(loader)["rgb"], places, strict=True):
+    for rgb, place in zip(next(loader).picture.rgb, places, strict=True):
         known, step = truth_of(name, place.where)
         red, green, blue = known.colour(step)
         expected = (blue, green, red) if mended else (red, green, blue)
@@ -151,10 +151,11 @@ def test_calibrated_depth_feeds_the_3d_path(folder):
     encoding = dataclasses.replace(ENCODING, use_points=True)
     loader = make(folder, (MANISKILL,), encoding=encoding, image_size=64, crop=0.6, streams=1, threads=0)
     batch = next(loader)
-    assert batch["depth"].shape == (4, 64, 64)
-    np.testing.assert_allclose(batch["depth"], DEPTH_COUNTS / 1024)
+    assert batch.picture.depth.shape == (4, 64, 64)
+    np.testing.assert_allclose(batch.picture.depth, DEPTH_COUNTS / 1024)
     world_from_camera = np.linalg.inv(camera_from_world())
-    for intrinsics, pose in zip(batch["intrinsics"], batch["world_from_camera"], strict=True):
+    camera = batch.picture.camera
+    for intrinsics, pose in zip(camera.intrinsics, camera.world_from_camera, strict=True):
         np.testing.assert_allclose(pose, world_from_camera, atol=1e-6)
         # The camera looks straight down from 1.5 m onto z = 0, so each pixel's point has z = 0, and a crop that moves
         # by one pixel moves the point by a pixel's size.
@@ -204,7 +205,7 @@ def test_unknown_words_need_a_vocabulary(folder, tmp_path, capsys):
     tokenizer = load_tokenizer(tmp_path / "words")
     assert f"--model.language.vocab-size {tokenizer.vocab_size}" in capsys.readouterr().out
     batch = next(make_with(tokenizer))
-    assert not np.any(batch["text_tokens"] == few.unk_id)
+    assert not np.any(batch.text.tokens == few.unk_id)
 
 
 def test_datasets_that_cannot_give_the_targets(folder):

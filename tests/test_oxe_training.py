@@ -15,7 +15,7 @@ import pytest
 from configs import get_config
 from dsvla_jax.encoding.displacement import displace
 from dsvla_jax.policy import Policy, load, load_policy_config
-from dsvla_jax.types import Camera, Observation
+from dsvla_jax.types import Camera, Observation, Picture, RobotState
 
 ROOT = Path(__file__).parent.parent
 DATASETS = ["nyu_rot_dataset_converted_externally_to_rlds", "utokyo_xarm_bimanual_converted_externally_to_rlds"]
@@ -67,11 +67,8 @@ def test_the_documented_sequence(tmp_path: Path):
     assert saved["scale"] == {"low": list(scale.low), "high": list(scale.high)}
     pose = np.array([[[0.3, -0.1, 1.1, 0, 1, 0, 0]]], np.float32)
     observation = Observation(
-        rgb=jnp.zeros((1, 96, 96, 3), jnp.uint8),
-        depth=jnp.zeros((1, 1, 1)),
-        camera=Camera(jnp.eye(3)[None], jnp.eye(4)[None]),
-        pose=jnp.asarray(pose),
-        gripper_open=jnp.ones((1, 1)),
+        Picture(jnp.zeros((1, 96, 96, 3), jnp.uint8), jnp.zeros((1, 1, 1)), Camera(jnp.eye(3)[None], jnp.eye(4)[None])),
+        RobotState(jnp.asarray(pose), jnp.ones((1, 1))),
     )
     bare = Policy(dataclasses.replace(policy.config, displacement=None), policy.variables, policy.tokenizer)
     told, answered = (one.decide(observation, ["lift the ball"], None).action for one in (policy, bare))

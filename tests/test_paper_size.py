@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from configs import get_config
+from dsvla_jax.encoding.encode import example_spec
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer
@@ -69,20 +70,8 @@ def test_training_step_has_consistent_shapes(shapes):
     targets = number_rows(small_tokenizer("sentencepiece"), EXPERIMENT.encoding.style).targets(0.0)
     step = make_train_step(EXPERIMENT, VLA(EXPERIMENT.model), optimizer, targets)
     state = jax.eval_shape(lambda tree: start_state(tree, optimizer, EXPERIMENT.seed), trainable)
-    size, text = EXPERIMENT.data.image_size, EXPERIMENT.encoding.max_text_length
-    batch = {
-        name: jax.ShapeDtypeStruct((EXPERIMENT.batch_size, *shape), dtype)
-        for name, shape, dtype in (
-            ("rgb", (size, size, 3), jnp.uint8),
-            ("depth", (size, size), jnp.float32),
-            ("intrinsics", (3, 3), jnp.float32),
-            ("world_from_camera", (4, 4), jnp.float32),
-            ("text_tokens", (text,), jnp.int32),
-            ("text_mask", (text,), bool),
-            ("answer_mask", (text,), bool),
-            ("number_rows", (text,), jnp.int32),
-        )
-    }
+    size = EXPERIMENT.data.image_size
+    batch = example_spec(EXPERIMENT.encoding, EXPERIMENT.batch_size, size, size)
     after, metrics = jax.eval_shape(step, state, frozen, batch)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert metrics["loss"].shape == ()

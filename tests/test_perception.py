@@ -171,10 +171,12 @@ def test_the_simulators_masks_are_of_the_objects_that_are_named():
     assert masks.shape == (2, 1, 128, 128)
     for i, top in enumerate(np.asarray(environment.keypoints(state))[:, 0, 0]):
         camera = front_camera(128)
-        found = locate(Sighting("button", masks[i, 0]), np.asarray(seen.depth)[i], camera)
+        found = locate(Sighting("button", masks[i, 0]), np.asarray(seen.picture.depth)[i], camera)
         # The keypoint is the button's top; its dome, 24 mm in radius, is seen from the side.
         assert np.linalg.norm(found.point - top) < 0.024
-        assert np.all(np.asarray(seen.rgb)[i][masks[i, 0]][:, 1] > np.asarray(seen.rgb)[i][masks[i, 0]][:, 0])
+        assert np.all(
+            np.asarray(seen.picture.rgb)[i][masks[i, 0]][:, 1] > np.asarray(seen.picture.rgb)[i][masks[i, 0]][:, 0]
+        )
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from dsvla_jax.encoding.alignment import align_to_patches
-from dsvla_jax.encoding.encode import CLIP_MEAN, CLIP_STD, EncodingConfig, build_prompt, encode_observation, encode_text
+from dsvla_jax.encoding.encode import (
+    CLIP_MEAN,
+    CLIP_STD,
+    EncodingConfig,
+    build_prompt,
+    encode_text,
+    model_inputs,
+    normalize_image,
+)
 from dsvla_jax.encoding.farthest_point import farthest_point_sample
 from dsvla_jax.encoding.neighbours import k_nearest_neighbours
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
@@ -14,7 +22,7 @@ from dsvla_jax.encoding.point_tokens import PointTokenizerConfig, positional_enc
 from dsvla_jax.encoding.prompts import Style, format_answer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.geometry.cameras import front_camera, unproject
-from dsvla_jax.types import Camera, ModelInputs, Observation
+from dsvla_jax.types import Array, Picture, RobotState, Text
 
 LOW, HIGH = (-1.5, -1.5, 0.76), (1.5, 1.5, 3.0)
 SMALL = PointTokenizerConfig(num_points=64, group_sizes=(32, 16, 9), neighbours=5, width=96)
@@ -243,30 +251,29 @@ def test_index_order_and_unknown_modes():
 CONFIG = EncodingConfig(image_size=32, patch_size=8, points=SMALL, style="compact", max_text_length=40)
 
 
-def observation(size: int, batch: int = 2, arms: int = 1) -> Observation:
+def picture(size: int, batch: int = 2) -> Picture[Array]:
     rng = np.random.default_rng(0)
-    one = front_camera(size)
-    stack = lambda leaf: jnp.stack([leaf] * batch)  # noqa: E731
-    return Observation(
-        rgb=jnp.asarray(rng.integers(0, 256, (batch, size, size, 3)), jnp.uint8),
-        depth=jnp.asarray(rng.uniform(0.8, 1.6, (batch, size, size)), jnp.float32),
-        camera=Camera(intrinsics=stack(one.intrinsics), world_from_camera=stack(one.world_from_camera)),
-        pose=jnp.tile(jnp.array([0.28, 0.0, 1.47, 0, 1, 0, 0]), (batch, arms, 1)),
-        gripper_open=jnp.ones((batch, arms)),
+    return Picture(
+        jnp.asarray(rng.integers(0, 256, (batch, size, size, 3)), jnp.uint8),
+        jnp.asarray(rng.uniform(0.8, 1.6, (batch, size, size)), jnp.float32),
+        jax.tree.map(lambda leaf: jnp.stack([leaf] * batch), front_camera(size)),
     )
 
 
-def test_encode_observation_makes_model_inputs_under_jit():
-    encode = jax.jit(encode_observation, static_argnums=1)
-    parts = encode(observation(32), CONFIG)
-    inputs = ModelInputs(**parts, text_tokens=jnp.zeros((2, 4), jnp.int32), text_mask=jnp.ones((2, 4), bool))
+def text(batch: int = 2) -> Text[Array]:
+    return Text(jnp.zeros((batch, 4), jnp.int32), jnp.ones((batch, 4), bool))
+
+
+def test_a_picture_and_a_text_become_model_inputs_under_jit():
+    inputs = jax.jit(model_inputs, static_argnums=2)(picture(32), text(), CONFIG)
     assert inputs.image.shape == (2, 32, 32, 3)
     assert inputs.point_tokens.shape == (2, 9, 96)
     assert inputs.point_patches.shape == (2, 9)
-    expected = (np.asarray(observation(32).rgb, np.float32) / 255 - CLIP_MEAN) / CLIP_STD
+    jax.tree.map(np.testing.assert_array_equal, inputs.text, text())
+    expected = (np.asarray(picture(32).rgb, np.float32) / 255 - CLIP_MEAN) / CLIP_STD
     np.testing.assert_allclose(inputs.image, expected, atol=1e-5)
     # The tokens are those of the cloud in farthest-point order, and each carries the patch of its own centre.
-    points, valid = cloud_from_depth(observation(32).depth[1], front_camera(32), LOW, HIGH, stride=2)
+    points, valid = cloud_from_depth(picture(32).depth[1], front_camera(32), LOW, HIGH, stride=2)
     order = brute_force_fps(np.asarray(points), np.asarray(valid), 64)
     tokens, centers = jax.jit(tokenize_points, static_argnums=1)(np.asarray(points)[order], SMALL)
     np.testing.assert_allclose(inputs.point_tokens[1], tokens, atol=1e-3)
@@ -275,21 +282,21 @@ def test_encode_observation_makes_model_inputs_under_jit():
     assert len(centers) == 9
 
 
-def test_encode_observation_takes_other_image_sizes_and_no_points():
-    parts = jax.eval_shape(lambda o: encode_observation(o, CONFIG), observation(48))
-    assert parts["image"].shape == (2, 32, 32, 3)
-    assert parts["point_tokens"].shape == (2, 9, 96)
-    flat = dataclasses.replace(observation(48), rgb=jnp.full((2, 48, 48, 3), 51, jnp.uint8))
-    image = encode_observation(flat, dataclasses.replace(CONFIG, use_points=False))
+def test_model_inputs_take_other_image_sizes_and_no_points():
+    shapes = jax.eval_shape(lambda seen: model_inputs(seen, text(), CONFIG), picture(48))
+    assert shapes.image.shape == (2, 32, 32, 3)
+    assert shapes.point_tokens.shape == (2, 9, 96)
+    flat = dataclasses.replace(picture(48), rgb=jnp.full((2, 48, 48, 3), 51, jnp.uint8))
+    inputs = model_inputs(flat, text(), dataclasses.replace(CONFIG, use_points=False))
     np.testing.assert_allclose(
-        image["image"], np.broadcast_to((0.2 - np.array(CLIP_MEAN)) / CLIP_STD, (2, 32, 32, 3)), atol=1e-5
+        inputs.image, np.broadcast_to((0.2 - np.array(CLIP_MEAN)) / CLIP_STD, (2, 32, 32, 3)), atol=1e-5
     )
-    assert image["point_tokens"].shape == (2, 0, 96)
-    assert image["point_patches"].shape == (2, 0)
+    assert inputs.point_tokens.shape == (2, 0, 96)
+    assert inputs.point_patches.shape == (2, 0)
     with pytest.raises(ValueError, match=r"at most the 16 points of a depth map of 16 x 16 pixels with .*stride 4"):
-        encode_observation(observation(16), dataclasses.replace(CONFIG, stride=4))
+        model_inputs(picture(16), text(), dataclasses.replace(CONFIG, stride=4))
     with pytest.raises(ValueError, match=r"expected a batch of uint8 images .* float32"):
-        encode_observation(dataclasses.replace(flat, rgb=jnp.zeros((2, 32, 32, 3))), CONFIG)
+        normalize_image(jnp.zeros((2, 32, 32, 3)), 32)
 
 
 def test_encode_text_masks_and_prefix():
@@ -299,13 +306,15 @@ def test_encode_text_masks_and_prefix():
     for style, arms in cases:
         config = dataclasses.replace(CONFIG, style=style)
         pose = np.tile(np.array([0.1, 0.2, 1.0, 0, 1, 0, 0], np.float32), (arms, 1))
-        prompt = build_prompt(config, "lift the lid", pose, np.ones(arms), np.full((arms, 3), 0.5))
+        robot = RobotState(pose, np.ones(arms))
+        prompt = build_prompt(config, "lift the lid", robot, np.full((arms, 3), 0.5))
         answer = format_answer(config.codec.encode(pose, np.zeros(arms)), style)
-        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, 300)
-        alone, alone_mask, nothing = encode_text(tokenizer, prompt, None, 300)
+        both, answer_mask = encode_text(tokenizer, prompt, answer, 300)
+        alone, nothing = encode_text(tokenizer, prompt, None, 300)
+        tokens, mask = both.tokens, both.mask
         assert tokens[0] == tokenizer.bos_id
-        length = alone_mask.sum()
-        np.testing.assert_array_equal(tokens[:length], alone[:length])
+        length = alone.mask.sum()
+        np.testing.assert_array_equal(tokens[:length], alone.tokens[:length])
         assert not nothing.any()
         assert not answer_mask[:length].any()
         assert answer_mask[length : mask.sum()].all()
@@ -317,12 +326,12 @@ def test_encode_text_masks_and_prefix():
 
 
 def test_prompt_without_keypoints():
-    pose = np.array([[0.1, 0.2, 1.0, 0, 1, 0, 0]])
-    assert build_prompt(CONFIG, "lift", pose, np.ones(1), np.ones((1, 3))) == (
+    robot = RobotState(np.array([[0.1, 0.2, 1.0, 0, 1, 0, 0]]), np.ones(1))
+    assert build_prompt(CONFIG, "lift", robot, np.ones((1, 3))) == (
         "lift state 10 20 100 0 100 0 0 1 near 100 100 100:"
     )
-    without = build_prompt(dataclasses.replace(CONFIG, use_keypoints=False), "lift", pose, np.ones(1), np.ones((1, 3)))
-    assert without == build_prompt(CONFIG, "lift", pose, np.ones(1), None) == "lift state 10 20 100 0 100 0 0 1:"
+    without = build_prompt(dataclasses.replace(CONFIG, use_keypoints=False), "lift", robot, np.ones((1, 3)))
+    assert without == build_prompt(CONFIG, "lift", robot, None) == "lift state 10 20 100 0 100 0 0 1:"
 
 
 def test_encoding_config_is_hashable():

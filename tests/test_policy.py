@@ -27,7 +27,7 @@ from dsvla_jax.policy import (
     load_vocabulary,
     save_policy_config,
 )
-from dsvla_jax.types import Camera, Observation
+from dsvla_jax.types import Camera, Observation, Picture, RobotState
 from tests.run_folders import MESHES, MODEL, NO_NOTES, variables_only, write_run
 from tests.serving import PROMPTS, observation, tiny_policy
 from tests.vocabularies import small_tokenizer
@@ -50,7 +50,8 @@ def batch(size: int) -> tuple[Observation, list[str], np.ndarray]:
     requests = [observation(seed) for seed in range(size)]
     stacked: Any = {name: np.stack([request[name] for request in requests]) for name in requests[0] if name != "prompt"}
     camera = Camera(stacked["intrinsics"], stacked["world_from_camera"])
-    observed = Observation(stacked["rgb"], stacked["depth"], camera, stacked["pose"], stacked["gripper_open"])
+    robot = RobotState(stacked["pose"], stacked["gripper_open"])
+    observed = Observation(Picture(stacked["rgb"], stacked["depth"], camera), robot)
     return observed, [PROMPTS[seed % len(PROMPTS)] for seed in range(size)], stacked["keypoints"][:, :, 0]
 
 

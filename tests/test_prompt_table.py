@@ -7,6 +7,7 @@ import pytest
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
 from dsvla_jax.encoding.prompt_table import instruction_tokens, make_prompt_table, write_prompts
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.types import RobotState
 
 INSTRUCTIONS = ["turn on the light", "stack 3 red blocks", "close the fridge"]
 
@@ -30,9 +31,9 @@ def test_prompts_are_those_of_the_host(style, arms, use_keypoints):
     write = jax.jit(lambda said, count, numbers: write_prompts(table, said, count, numbers, size, tokenizer.pad_id))
     tokens, mask = write(beginnings, lengths, integers)
     for i, instruction in enumerate(INSTRUCTIONS):
-        prompt = build_prompt(config, instruction, pose[i], gripper[i], keypoints[i])
-        expected, expected_mask, _ = encode_text(tokenizer, prompt, None, config.max_text_length)
-        length = int(expected_mask.sum())
+        prompt = build_prompt(config, instruction, RobotState(pose[i], gripper[i]), keypoints[i])
+        expected, _ = encode_text(tokenizer, prompt, None, config.max_text_length)
+        length = int(expected.mask.sum())
         assert int(mask[i].sum()) == length
-        np.testing.assert_array_equal(tokens[i, :length], expected[:length])
+        np.testing.assert_array_equal(tokens[i, :length], expected.tokens[:length])
         assert (np.asarray(tokens)[i, length:] == tokenizer.pad_id).all()

@@ -241,7 +241,7 @@ def test_another_box_takes_other_poses(tmp_path):
     high = dataclasses.replace(GOOD, pose=np.add(GOOD.pose, [0, 0, 1.2, 0, 0, 0, 0]), keypoints=None)
     with DemonstrationWriter(tmp_path, codec=PoseCodec(high=(1.0, 1.0, 3.0))) as writer:
         writer.add(high, keyframes=[5, 11])
-    assert EpisodeReader(tmp_path).frame(0)["keypoint"].shape == (0, 3)
+    assert EpisodeReader(tmp_path).frame(0).keypoint.shape == (0, 3)
 
 
 def test_where_joints_rest_can_be_chosen_and_is_kept(tmp_path, capsys):

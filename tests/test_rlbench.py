@@ -310,7 +310,7 @@ def test_without_keypoints(source, tmp_path):
     for number in range(2):
         episode = EpisodeReader(tmp_path).episode(number)
         assert episode.num_frames == 4
-        assert decode_frame(episode, 0)["keypoint"].shape == (0, 3)
+        assert decode_frame(episode, 0).keypoint.shape == (0, 3)
 
 
 def test_contacts_are_where_grippers_change():

@@ -77,7 +77,9 @@ def test_an_episode_is_the_same_whatever_the_size_of_the_batch():
 
         def act(observation, instructions, keypoints):
             calls.append(list(zip(instructions, keypoints, strict=True)))
-            return Action(jnp.asarray(observation.pose), jnp.asarray(observation.gripper_open)), [""] * batch
+            return Action(jnp.asarray(observation.robot.pose), jnp.asarray(observation.robot.gripper_open)), [
+                ""
+            ] * batch
 
         run_task(lamp, act, EPISODES, split="validation", batch=batch, keypoint_noise=0.1)
         return [turn for call in calls[:: 2 * lamp.expert_keyframes] for turn in call]
@@ -185,7 +187,7 @@ def test_an_episode_whose_object_is_not_seen_is_over_and_says_so():
 
     def act(observation, instructions, keypoints):
         told.append(keypoints)
-        return Action(observation.pose, observation.gripper_open), ["stay"] * EPISODES
+        return Action(observation.robot.pose, observation.robot.gripper_open), ["stay"] * EPISODES
 
     endings = run_episodes(env, act, hidden, limit=2, find_keypoints=SegmentationKeypoints(env, hidden))
     reason = "keypoints not found: 'little green light switch': its mask is empty"
@@ -200,7 +202,7 @@ def test_noise_moves_the_keypoints_that_the_policy_is_told():
 
     def act(observation, instructions, keypoints):
         told.append(keypoints)
-        return Action(observation.pose, observation.gripper_open), [""] * EPISODES
+        return Action(observation.robot.pose, observation.robot.gripper_open), [""] * EPISODES
 
     for noise in (0.0, 0.05):
         run_episodes(environment("lamp_on"), act, start_of("lamp_on"), limit=1, noise=noise)

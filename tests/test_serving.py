@@ -188,8 +188,8 @@ def test_poses_may_be_lists_and_any_float(running_server):
     request = observation(3)
     other = {**request, "pose": request["pose"].tolist(), "depth": request["depth"].astype(np.float64)}
     first, second = (parse_request(one, running_server[0].expected) for one in (request, other))
-    assert_same(np.asarray(second.observation.pose), np.asarray(first.observation.pose))
-    assert_same(np.asarray(second.observation.depth), np.asarray(first.observation.depth))
+    assert_same(np.asarray(second.observation.robot.pose), np.asarray(first.observation.robot.pose))
+    assert_same(np.asarray(second.observation.picture.depth), np.asarray(first.observation.picture.depth))
 
 
 def test_a_robot_is_told_what_to_send_and_gets_the_policys_action(running_server, client, policy):

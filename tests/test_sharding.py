@@ -211,11 +211,11 @@ def test_narrowing_the_frozen_base_changes_nothing():
     experiment = tiny_experiment("adapter", points=False)
     experiment = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, dtype="bfloat16"))
     trainable, frozen = split_variables(initialize(experiment.model, jax.random.key(0)), "lora")
-    batch: Any = batches(experiment)[0]
+    batch = jax.tree.map(jnp.asarray, batches(experiment)[0])
 
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def logits(frozen):
-        inputs = model_inputs(batch, experiment.encoding)
+        inputs = model_inputs(batch.picture, batch.text, experiment.encoding)
         return VLA(experiment.model).apply(join_variables(trainable, frozen), inputs)
 
     np.testing.assert_array_equal(logits(narrow_frozen(frozen, jnp.dtype("bfloat16"))), logits(frozen))

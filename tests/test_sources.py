@@ -117,7 +117,7 @@ def test_without_keypoints_the_prompt_goes_without(folder, tmp_path):
         data = data_config(path, tasks=("lamp_on",))
         reader = open_demonstrations(data, suite_tokenizer())
         sample = make_sampler(data, encoding, suite_tokenizer())(reader.frame(0), np.random.default_rng(0))
-        texts[path] = suite_tokenizer().decode(sample["text_tokens"][sample["text_mask"]].tolist())
+        texts[path] = suite_tokenizer().decode(sample.text.tokens[sample.text.mask].tolist())
     assert "near" in texts[folder]
     assert "near" not in texts[tmp_path / "out"]
 

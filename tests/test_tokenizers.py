@@ -125,14 +125,15 @@ def test_answers_are_written_as_the_tokenizer_writes_the_whole_text(kind, style)
         arms = 1 + seed % 2
         integers = random_integers(arms, seed)
         prompt, answer = format_prompt("lift the tray", integers, None, style), format_answer(integers, style)
-        tokens, mask, answer_mask = encode_text(tokenizer, prompt, answer, 600)
+        text, answer_mask = encode_text(tokenizer, prompt, answer, 600)
+        tokens, mask = text.tokens, text.mask
         assert tokens[mask].tolist() == [
             tokenizer.bos_id,
             *tokenizer.encode(prompt + SEPARATOR + answer),
             tokenizer.eos_id,
         ]
-        alone, alone_mask, _ = encode_text(tokenizer, prompt, None, 600)
-        np.testing.assert_array_equal(alone[alone_mask], tokens[mask & ~answer_mask])
+        alone, _ = encode_text(tokenizer, prompt, None, 600)
+        np.testing.assert_array_equal(alone.tokens[alone.mask], tokens[mask & ~answer_mask])
         grammar = build_answer_grammar(tokenizer, arms, style)
         assert grammar.tokens(integers) == tokens[answer_mask].tolist()
         read = tokenizer.decode(tokens[answer_mask].tolist())

@@ -14,8 +14,8 @@ from data_pipelines.episodes import EpisodeReader, write_episodes
 from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from tests.random_data import random_episode
 from tests.small import SMALL_RUN
-from tests.test_data import random_episode
 
 ROOT = Path(__file__).parent.parent
 

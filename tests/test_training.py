@@ -20,6 +20,8 @@ from dsvla_jax.model.variables import join_variables, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.objective import answer_loss
 from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
+from dsvla_jax.types import Example
+from tests.random_data import random_example, text_example
 from tests.small import small_encoding, small_language, small_vision
 from tests.vocabularies import KINDS, small_tokenizer
 
@@ -42,23 +44,10 @@ def small_experiment(**changes) -> Experiment:
     )
 
 
-def random_batch(experiment: Experiment) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(0)
-    size, image, text = experiment.batch_size, 32, experiment.encoding.max_text_length
-    camera = np.eye(4, dtype=np.float32)
-    intrinsics = np.array([[-40, 0, 16], [0, -40, 16], [0, 0, 1]], np.float32)
-    answer = np.zeros((size, text), bool)
-    answer[:, 8:12] = True
-    return {
-        "rgb": rng.integers(0, 255, (size, image, image, 3), np.uint8),
-        "depth": rng.uniform(0.8, 1.2, (size, image, image)).astype(np.float32),
-        "intrinsics": np.broadcast_to(intrinsics, (size, 3, 3)),
-        "world_from_camera": np.broadcast_to(camera, (size, 4, 4)),
-        "text_tokens": rng.integers(4, VOCABULARY, (size, text)).astype(np.int32),
-        "text_mask": np.ones((size, text), bool),
-        "answer_mask": answer,
-        "number_rows": np.zeros((size, text), np.int32),
-    }
+def random_batch(experiment: Experiment) -> Example[np.ndarray]:
+    place = np.arange(experiment.encoding.max_text_length)
+    answer = np.tile((place >= 8) & (place < 12), (experiment.batch_size, 1))
+    return random_example(np.random.default_rng(0), answer, VOCABULARY)
 
 
 def train(experiment: Experiment, steps: int):
@@ -115,11 +104,12 @@ def test_few_steps_have_a_schedule(steps):
 def test_only_answer_tokens_are_learned():
     rng = np.random.default_rng(0)
     logits = jnp.asarray(rng.normal(size=(2, 6, 10)), jnp.float32)
-    tokens = jnp.asarray(rng.integers(0, 10, (2, 6)))
-    answer = jnp.zeros((2, 6), bool).at[:, 4:].set(True)
+    tokens = rng.integers(0, 10, (2, 6))
+    answer = np.broadcast_to(np.arange(6) >= 4, (2, 6))
+    batch = jax.tree.map(jnp.asarray, text_example(tokens, answer, np.zeros((2, 6), np.int32)))
 
     def loss(logits):
-        return answer_loss(logits, tokens, answer, jnp.zeros_like(tokens), NO_NUMBERS)[0]
+        return answer_loss(logits, batch, NO_NUMBERS)[0]
 
     gradient = np.abs(np.asarray(jax.grad(loss)(logits))).sum(-1)
     assert (gradient[:, 3:5] > 0).all(), "positions 3 and 4 predict the answer tokens 4 and 5"
@@ -134,13 +124,13 @@ def number_example(tokenizer: Tokenizer, guess: list[list[int]], sigma: float = 
     truth = np.array([[12, -7, 140, 0, 99, 0, 7, 1]])
     numbers = number_rows(tokenizer, "paper")
     prompt = format_prompt("lift", truth, None, "paper")
-    tokens, _, answer = encode_text(tokenizer, prompt, format_answer(truth, "paper"), 400)
+    text, answer = encode_text(tokenizer, prompt, format_answer(truth, "paper"), 400)
     rows = np.zeros(400, np.int32)
     rows[answer] = numbers.rows(truth)
-    predicted = encode_text(tokenizer, prompt, format_answer(np.array(guess), "paper"), 400)[0]
-    logits = 50.0 * jax.nn.one_hot(np.roll(predicted, -1), tokenizer.vocab_size)
-    logits, tokens, answer, rows = (jnp.asarray(x)[None] for x in (logits, tokens, answer, rows))
-    return {k: float(v) for k, v in answer_loss(logits, tokens, answer, rows, numbers.targets(sigma))[1].items()}
+    predicted = encode_text(tokenizer, prompt, format_answer(np.array(guess), "paper"), 400)[0].tokens
+    logits = 50.0 * jax.nn.one_hot(np.roll(predicted, -1), tokenizer.vocab_size)[None]
+    batch = jax.tree.map(jnp.asarray, text_example(text.tokens[None], answer[None], rows[None]))
+    return {k: float(v) for k, v in answer_loss(logits, batch, numbers.targets(sigma))[1].items()}
 
 
 @pytest.mark.parametrize("kind", KINDS)

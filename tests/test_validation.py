@@ -29,28 +29,29 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
 from dsvla_jax.training.validation import guess_integers, number_errors
+from dsvla_jax.types import HeldOutExample
+from tests.random_data import random_episode, text_example
 from tests.small import small_encoding, small_language, small_vision
-from tests.test_data import random_episode
 from tests.vocabularies import KINDS, small_tokenizer
 
 
-def number_batch(tokenizer: Tokenizer, truth: np.ndarray) -> dict[str, np.ndarray]:
-    """The text of one validation example with this answer (A, 8)."""
+def number_batch(tokenizer: Tokenizer, truth: np.ndarray) -> HeldOutExample[np.ndarray]:
+    """One validation example with this answer (A, 8), as a batch."""
     numbers = number_rows(tokenizer, "paper")
     prompt = format_prompt("lift the tray", truth, None, "paper")
-    tokens, _, answer = encode_text(tokenizer, prompt, format_answer(truth, "paper"), 500)
+    text, answer = encode_text(tokenizer, prompt, format_answer(truth, "paper"), 500)
     rows, number_of, integers = np.zeros(500, np.int32), np.zeros(500, np.int32), np.zeros((2, 8), np.int32)
     rows[answer], number_of[answer] = numbers.rows(truth), numbers.numbers(truth)
     integers[: len(truth)] = truth
-    batch = {"text_tokens": tokens, "number_rows": rows, "number_of": number_of, "integers": integers}
-    return {name: value[None] for name, value in batch.items()} | {"answer": answer[None]}
+    example = text_example(text.tokens[None], answer[None], rows[None])
+    return HeldOutExample(example, integers[None], number_of[None])
 
 
 def most_probable(
-    tokenizer: Tokenizer, truth: np.ndarray, logits: np.ndarray, batch: dict[str, np.ndarray]
+    tokenizer: Tokenizer, truth: np.ndarray, logits: np.ndarray, batch: HeldOutExample[np.ndarray]
 ) -> np.ndarray:
     """What `guess_integers` should say, number by number and token by token."""
-    place, guesses = int(batch["answer"][0].argmax()), []
+    place, guesses = int(batch.example.answer_mask[0].argmax()), []
     grammar = build_answer_grammar(tokenizer, len(truth), "paper")
     for index, (slot, value) in enumerate(zip(grammar.slots, truth.ravel(), strict=True)):
         place += len(grammar.templates[index])
@@ -80,7 +81,8 @@ def test_the_most_probable_numbers_are_found(kind):
         batch = number_batch(tokenizer, truth)
         logits = rng.normal(size=(1, 500, tokenizer.vocab_size)).astype(np.float32)
         # The right tokens are probable enough for numbers to be right, or wrong at their last token only.
-        np.put_along_axis(logits[:, :-1], batch["text_tokens"][:, 1:, None], rng.normal(2.5, 1, (1, 499, 1)), axis=2)
+        right = batch.example.text.tokens[:, 1:, None]
+        np.put_along_axis(logits[:, :-1], right, rng.normal(2.5, 1, (1, 499, 1)), axis=2)
         guess = np.asarray(guess_integers(jnp.asarray(logits), jax.tree.map(jnp.asarray, batch), targets))[0]
         np.testing.assert_array_equal(guess[:arms], most_probable(tokenizer, truth, logits, batch))
         differing += (guess[:arms] != truth).sum()
@@ -97,11 +99,12 @@ def test_errors_are_those_of_the_poses():
     guess[1, 0, :7] = [1, 0, 100, 0, 0, 0, 0]  # no rotation is no turn
     guess[1, 1] = 77  # there is no second arm here
     number_of = np.array([[0, 1, 16], [0, 1, 8]])
-    batch = {"integers": jnp.asarray(truth), "number_of": jnp.asarray(number_of)}
-    experiment = Experiment(small_encoding(), ModelConfig(small_vision(), small_language(40)))
+    nothing = np.zeros_like(number_of)
+    batch = HeldOutExample(text_example(nothing, nothing > 0, nothing), truth, number_of)
+    batch = jax.tree.map(jnp.asarray, batch)
     figures = {
         name: float(total / count)
-        for name, (total, count) in number_errors(jnp.asarray(guess), batch, experiment).items()
+        for name, (total, count) in number_errors(jnp.asarray(guess), batch, small_encoding().codec).items()
     }
     expected = {
         "bin_exact": (5 / 7 + 5 / 7 + 5 / 7) / 3,
@@ -123,12 +126,12 @@ def test_samples_to_validate_with_are_as_recorded(tmp_path: Path):
         frame = reader.frame(number)
         one, other = (sample(frame, np.random.default_rng(seed)) for seed in (1, 2))
         jax.tree.map(np.testing.assert_array_equal, one, other)
-        np.testing.assert_array_equal(one["rgb"], frame.picture.rgb)
+        np.testing.assert_array_equal(one.example.picture.rgb, frame.picture.rgb)
         bins = encoding.codec.encode(frame.target.pose, frame.target.gripper_open)
-        np.testing.assert_array_equal(one["integers"][:arms], bins)
+        np.testing.assert_array_equal(one.integers[:arms], bins)
         # Its tokens spell each number.
         for index, value in enumerate(np.asarray(bins).ravel()):
-            tokens = one["text_tokens"][one["number_of"] == index + 1]
+            tokens = one.example.text.tokens[one.number_of == index + 1]
             assert tokenizer.decode(tokens.tolist()).strip() == str(value)
 
 
@@ -138,7 +141,7 @@ def test_held_out_demonstrations_are_whole_episodes_that_training_leaves(tmp_pat
     tokenizer = small_tokenizer("digits")
     held_out = open_held_out(data, tokenizer, 2)
     assert [held_out.episode(number).seed for number in range(len(held_out))] == [4, 5]
-    assert held_out.frame(3)["instruction"] == "do lamp_on number 5"
+    assert held_out.frame(3).instruction == "do lamp_on number 5"
     with pytest.raises(UserError, match=r"training uses all demonstrations of lamp_on.*--data\.episodes"):
         open_held_out(dataclasses.replace(data, episodes=7), tokenizer, 2)
 

@@ -11,9 +11,10 @@ import pytest
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.llama import Llama
 from dsvla_jax.model.lora import merge_lora
-from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.model.vla import VLA, extend, initialize, lm_head, prefill
 from dsvla_jax.types import ModelInputs
 from tests.decoding import check_against_the_full_forward_pass, check_padding_and_batch_mates, small_grammar
+from tests.random_data import random_inputs
 
 VOCAB = 40
 CONFIG = ModelConfig(
@@ -34,15 +35,7 @@ LENGTHS = np.array([7, 4, 1])
 
 
 def make_inputs(lengths=(8, 8), points=3, seed=0) -> ModelInputs:
-    rng = np.random.default_rng(seed)
-    batch, padded = len(lengths), max(lengths)
-    return ModelInputs(
-        image=jnp.asarray(rng.normal(size=(batch, 16, 16, 3)), jnp.float32),
-        point_tokens=jnp.asarray(rng.normal(size=(batch, points, 32)), jnp.float32),
-        point_patches=jnp.asarray(rng.integers(0, 4, (batch, points)), jnp.int32),
-        text_tokens=jnp.asarray(rng.integers(0, VOCAB, (batch, padded)), jnp.int32),
-        text_mask=jnp.arange(padded)[None] < jnp.asarray(lengths)[:, None],
-    )
+    return random_inputs(CONFIG.vision, range(VOCAB), np.array(lengths), max(lengths), points, seed)
 
 
 def opened(config: ModelConfig) -> dict[str, Any]:
@@ -161,7 +154,7 @@ def oracle_logits(config: ModelConfig, variables, inputs: ModelInputs) -> np.nda
     )
     results = []
     for seen, patches, text in zip(
-        outputs, np.asarray(inputs.point_patches), np.asarray(inputs.text_tokens), strict=True
+        outputs, np.asarray(inputs.point_patches), np.asarray(inputs.text.tokens), strict=True
     ):
         x = layer_norm(seen @ p["clip_proj"]["kernel"] + p["clip_proj"]["bias"], p["clip_proj_norm"])
         rows = np.array([*range(5), *(1 + patches)])
@@ -200,7 +193,7 @@ def test_gate_of_zero_leaves_the_language_model_alone():
         dataclasses.replace(inputs, point_patches=3 - inputs.point_patches),
         make_inputs(points=0),
     ):
-        changed = dataclasses.replace(changed, text_tokens=inputs.text_tokens)
+        changed = dataclasses.replace(changed, text=inputs.text)
         np.testing.assert_array_equal(forward(variables, changed), logits)
 
     def language_model(model: Llama, tokens):
@@ -209,7 +202,7 @@ def test_gate_of_zero_leaves_the_language_model_alone():
         return model.lm_head(hidden)
 
     own = {name: variables[name]["language"] for name in ("params", "lora")}
-    alone: Any = Llama(CONFIG).apply(own, inputs.text_tokens, method=language_model)
+    alone: Any = Llama(CONFIG).apply(own, inputs.text.tokens, method=language_model)
     np.testing.assert_allclose(logits, alone, atol=1e-5)
 
 
@@ -273,18 +266,18 @@ def test_decoding_is_the_best_choice_of_the_full_forward_pass(case):
 def test_prefill_makes_the_prompts_keys_once_and_extend_keeps_them(variables):
     model, inputs = VLA(CONFIG), make_inputs()
     full = jax.jit(model.apply)(variables, inputs)
-    head = dataclasses.replace(inputs, text_tokens=inputs.text_tokens[:, :4], text_mask=inputs.text_mask[:, :4])
-    hidden, cache = jax.jit(lambda head: model.apply(variables, head, 4, method="prefill"))(head)
-    logits = jax.jit(lambda hidden: model.apply(variables, hidden, method="lm_head"))
+    head = dataclasses.replace(inputs, text=jax.tree.map(lambda x: x[:, :4], inputs.text))
+    hidden, cache = jax.jit(lambda head: prefill(model, variables, head, 4))(head)
+    logits = jax.jit(lambda hidden: lm_head(model, variables, hidden))
     np.testing.assert_allclose(logits(hidden), full[:, 3], atol=1e-4)
     assert cache.keys.shape == (3, 2, 2, 8, 8), "the text alone has slots"
     assert cache.prompt.keys.shape == (3, 2, 2, 5 + 3, 8)
     before = cache.prompt
-    extend = jax.jit(lambda *args: model.apply(variables, *args, method="extend"))
+    extended = jax.jit(lambda *args: extend(model, variables, *args))
     for place in range(4, 8):
         positions = jnp.full((2, 1), place)
         mask = jnp.arange(8) <= positions[..., None]
-        hidden, cache = extend(inputs.text_tokens[:, place : place + 1], positions, mask, cache, place)
+        hidden, cache = extended(inputs.text.tokens[:, place : place + 1], positions, mask, cache, place)
         np.testing.assert_allclose(logits(hidden[:, 0]), full[:, place], atol=1e-4)
     jax.tree.map(np.testing.assert_array_equal, cache.prompt, before)
 

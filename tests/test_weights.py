@@ -15,7 +15,7 @@ import pytest
 from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, RopeScaling, VisionConfig
 from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.types import ModelInputs
+from dsvla_jax.types import ModelInputs, Text
 from dsvla_jax.weights import __main__ as program
 from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
 from dsvla_jax.weights.imported_folder import create_weights
@@ -461,8 +461,7 @@ def test_a_model_runs_from_an_imported_folder(imported):
         image=jnp.zeros((1, 15, 15, 3)),
         point_tokens=jnp.zeros((1, 2, 16)),
         point_patches=jnp.zeros((1, 2), jnp.int32),
-        text_tokens=jnp.ones((1, 4), jnp.int32),
-        text_mask=jnp.ones((1, 4), bool),
+        text=Text(jnp.ones((1, 4), jnp.int32), jnp.ones((1, 4), bool)),
     )
     logits = VLA(config).apply({"params": variables["params"] | backbones}, inputs)
     assert np.isfinite(np.asarray(logits)).all()

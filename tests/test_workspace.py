@@ -187,7 +187,7 @@ def test_depth_without_readings_or_in_other_units_stops_or_is_left_out(tmp_path,
         list(islice(loader, 20))
     loader = make(skip_bad=True)
     for _ in range(20):
-        assert (next(loader)["depth"] > 0).any(axis=(1, 2)).all()
+        assert (next(loader).picture.depth > 0).any(axis=(1, 2)).all()
     assert len(loader.left_out) == 1
 
 

@@ -17,6 +17,7 @@ from benchmarks._accelerator.device import gib
 from benchmarks._accelerator.sections import Job, Size
 from benchmarks._timing import Timing, timed
 from configs import get_config
+from data_pipelines.records import Frame
 from data_pipelines.samples import make_sampler
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import EncodingConfig
@@ -35,7 +36,7 @@ from dsvla_jax.training.chips import peak_flops
 from dsvla_jax.training.flops import model_flops, prefill_flops
 from dsvla_jax.training.sharding import make_mesh, put_batch
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step, start_state
-from dsvla_jax.types import Camera, Observation
+from dsvla_jax.types import Action, Example, Observation, Picture, RobotState
 from tests.vocabularies import INSTRUCTIONS, small_tokenizer
 
 # What variables of these names begin with; all others are random.
@@ -64,10 +65,10 @@ def paper_experiment(size: Size) -> Experiment:
     )
 
 
-def frames(experiment: Experiment, count: int) -> list[dict[str, Any]]:
+def frames(experiment: Experiment, count: int) -> list[Frame]:
     """Frames of one arm that nobody has recorded: random pictures, poses and depths over the table."""
     rng, size = np.random.default_rng(0), experiment.data.image_size
-    camera = front_camera(size)
+    camera = jax.tree.map(np.asarray, front_camera(size))
 
     def pose() -> np.ndarray:
         turn = rng.normal(size=(1, 4))
@@ -76,28 +77,31 @@ def frames(experiment: Experiment, count: int) -> list[dict[str, Any]]:
         ).astype(np.float32)
 
     return [
-        {
-            "rgb": rng.integers(0, 256, (size, size, 3), dtype=np.uint8),
-            "depth": rng.uniform(0.8, 1.3, (size, size)).astype(np.float32),
-            "intrinsics": np.asarray(camera.intrinsics),
-            "world_from_camera": np.asarray(camera.world_from_camera),
-            "instruction": INSTRUCTIONS[number % len(INSTRUCTIONS)],
-            "pose": pose(),
-            "gripper_open": np.ones(1, np.float32),
-            "keypoint": pose()[:, :3],
-            "target_pose": pose(),
-            "target_gripper": np.zeros(1, np.float32),
-        }
+        Frame(
+            picture=Picture(
+                rng.integers(0, 256, (size, size, 3), dtype=np.uint8),
+                rng.uniform(0.8, 1.3, (size, size)).astype(np.float32),
+                camera,
+            ),
+            robot=RobotState(pose(), np.ones(1, np.float32)),
+            keypoint=pose()[:, :3],
+            target=Action(pose(), np.zeros(1, np.float32)),
+            instruction=INSTRUCTIONS[number % len(INSTRUCTIONS)],
+            task="lamp_on",
+            task_index=0,
+            episode=number,
+            frame=0,
+        )
         for number in range(count)
     ]
 
 
-def train_batch(experiment: Experiment, tokenizer: Tokenizer, size: int) -> dict[str, np.ndarray]:
+def train_batch(experiment: Experiment, tokenizer: Tokenizer, size: int) -> Example[np.ndarray]:
     """A batch of such frames as training reads it."""
     plain = DataConfig(keypoint_noise=0.0, image_size=experiment.data.image_size)
     sample = make_sampler(plain, experiment.encoding, tokenizer)
-    samples: list[Any] = [sample(one, np.random.default_rng(0)) for one in frames(experiment, size)]  # pyright: ignore
-    return {name: np.stack([one[name] for one in samples]) for name in samples[0]}
+    samples = [sample(one, np.random.default_rng(0)) for one in frames(experiment, size)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
 
 
 def random_variables(shapes: Any, mesh: jax.sharding.Mesh) -> Any:
@@ -190,7 +194,7 @@ def train(job: Job) -> None:
             "trace_seconds": traced,
             "examples_per_second": size / timing.median,
             # As metrics.jsonl counts them, and with the padding, which is computed all the same.
-            "tokens_per_second": int(batch["text_mask"].sum()) / timing.median,
+            "tokens_per_second": int(batch.text.mask.sum()) / timing.median,
             "positions_per_second": positions / timing.median,
             "tflops": flops / timing.median / 1e12,
             "utilisation": flops / timing.median / peak if peak else 0.0,
@@ -216,18 +220,13 @@ def decode(job: Job) -> None:
             job.note(**{f"robots {robots}": {"skipped": f"{job.left():.0f} s were left"}})
             continue
         asked = frames(experiment, robots)
-        seen = {name: np.stack([one[name] for one in asked]) for name in asked[0] if name != "instruction"}
-        observation = Observation(
-            rgb=jnp.asarray(seen["rgb"]),
-            depth=jnp.asarray(seen["depth"]),
-            camera=Camera(jnp.asarray(seen["intrinsics"]), jnp.asarray(seen["world_from_camera"])),
-            pose=jnp.asarray(seen["pose"]),
-            gripper_open=jnp.asarray(seen["gripper_open"]),
-        )
-        instructions = [one["instruction"] for one in asked]
+        seen = [(Observation(one.picture, one.robot), one.keypoint) for one in asked]
+        observation, keypoints = jax.tree.map(lambda *leaves: np.stack(leaves), *seen)
+        observation = jax.tree.map(jnp.asarray, observation)
+        instructions = [one.instruction for one in asked]
         decision, timing = timed(
-            lambda observation=observation, instructions=instructions, seen=seen: (
-                policy.decide(observation, instructions, seen["keypoint"]).action
+            lambda observation=observation, instructions=instructions, keypoints=keypoints: (
+                policy.decide(observation, instructions, keypoints).action
             ),
             job.sizes.actions,
         )

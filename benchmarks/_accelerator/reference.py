@@ -4,6 +4,7 @@ Runs beside the first sections, in a process for which JAX has no other device t
 there once it is complete; why one could not be made stands in another file.
 """
 
+import dataclasses
 import pickle
 import sys
 import traceback
@@ -50,7 +51,7 @@ def make_episodes(sizes: Sizes, _: Path) -> dict[str, Any]:
     start = starts(EPISODE_TASK, reference.image_size, "eval", sizes.compared)
     plan = reference.expert(start)
     missed = np.random.default_rng(0).uniform(-MISS, MISS, (*plan.pose.shape[:3], 3))
-    plan = plan.replace(pose=plan.pose.at[..., :3].add(missed.astype(np.float32)))
+    plan = dataclasses.replace(plan, pose=plan.pose.at[..., :3].add(missed.astype(np.float32)))
     return {
         "task": EPISODE_TASK,
         **on_host({"start": start, "plan": plan}),
