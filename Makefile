@@ -29,7 +29,7 @@ setup: $(VENV)/.synced  ## make the virtual environment
 train: setup  ## demonstrations, training, closed-loop evaluation and report for CONFIG (default: tiny)
 	$(PY) train.py $(CONFIG) --run $(RUN) $(TRAIN_OPTIONS)
 	$(PY) eval.py $(RUN) --skip-finished $(EVAL_OPTIONS)
-	@echo "report: $(RUN)/eval/mujoco.html"
+	@echo "report: $(RUN)/eval/report.html"
 
 test: setup  ## the test suite, on up to four cores
 	$(PY) -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal

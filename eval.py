@@ -1,8 +1,8 @@
 """Evaluate a run in closed loop: python eval.py RUN [--tasks all] [--episodes 25] [--physics mjx] [--compare RUN ...]
 
 Every episode starts from a seed that no demonstration used. Prints success rates with Wilson 95 % intervals and writes,
-in RUN/eval, one line of JSON an episode and an HTML report with a film strip of each. Results of other tasks stay.
-Results of another checkpoint that are replaced move to the file that --step names.
+in RUN/eval, one line of JSON an episode (results.jsonl), with the conditions it was run under, and an HTML report with
+a film strip of each. Results of other tasks, conditions and checkpoints stay.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,25 +21,27 @@ import dsvla_jax.policy
 from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.report import (
+from dsvla_jax.evaluation.conditions import Conditions
+from dsvla_jax.evaluation.device_loop import DeviceLoop
+from dsvla_jax.evaluation.loop import on_host, run_task
+from dsvla_jax.evaluation.outcome import EpisodeOutcome
+from dsvla_jax.evaluation.pictures import film_strip, mark_targets
+from dsvla_jax.evaluation.report import print_comparison, print_table, write_report
+from dsvla_jax.evaluation.results import (
     EpisodeResult,
-    film_strip,
-    mark_targets,
+    finished_tasks,
+    latest,
     merge_results,
-    print_comparison,
-    print_table,
     read_results,
     require_writable,
-    write_report,
     write_results,
 )
-from dsvla_jax.evaluation.rollout import Ending, run_task
 from dsvla_jax.experiment import Experiment, load_experiment, require_simulated
 from dsvla_jax.files import write_picture
 from dsvla_jax.model.decode import Decoding
 from dsvla_jax.perception.simulator import Keypoints, keypoint_source
 from dsvla_jax.policy import Policy
-from dsvla_jax.ranges import at_least, check_fields
+from dsvla_jax.ranges import at_least, check_fields, require
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.shifts import check_shifts
 from dsvla_jax.sim.tasks import select_tasks
@@ -53,6 +55,10 @@ class Options:
     """The run folder that train.py wrote."""
     physics: Literal["mujoco", "mjx"] = "mujoco"
     """C MuJoCo on the processor, or vectorised MJX on whatever device JAX has."""
+    loop: Literal["host", "device"] = "host"
+    """Where the closed loop runs: on the host, which asks the policy before every keyframe, or on the device, as one
+    jitted program for a whole batch of episodes. The latter requires --physics mjx, finds keypoints once, and keeps the
+    last view alone."""
     tasks: tuple[str, ...] = ()
     """Names (with spaces or commas between), all, single_arm or dual_arm; those the run was trained on if not given."""
     episodes: int | None = None
@@ -91,6 +97,11 @@ class Options:
             step=at_least(0),
             seed=at_least(0),
         )
+        if self.loop == "device":
+            require(self.physics == "mjx", "loop", "'host' with physics 'mujoco'", "'device'", "add --physics mjx")
+            found = "found before every keyframe"
+            once = self.keypoints != "segmentation-refresh"
+            require(once, "loop", f"'host' with keypoints that are {found}", "'device'", "use --keypoints segmentation")
 
     @property
     def results(self) -> Path:
@@ -101,9 +112,7 @@ class Options:
 def main(options: Options) -> None:
     """Evaluates, prints the table, writes results and report."""
     if options.compare:
-        files = {options.run: results_file(options.results, options)}
-        files |= {run: results_file(run / "eval", options) for run in options.compare}
-        print_comparison({str(run): read_results(file) for run, file in files.items()})
+        print_comparison({str(run): compared(run, options) for run in (options.run, *options.compare)})
         return
     if not (options.run / "config.json").exists():
         raise UserError(f"{options.run}: no run here (config.json is missing); train one: python train.py CONFIG")
@@ -111,101 +120,88 @@ def main(options: Options) -> None:
     require_simulated(experiment, options.run)
     tasks = select_tasks(options.tasks or experiment.data.tasks)
     episodes = experiment.evaluation.episodes if options.episodes is None else options.episodes
-    file = results_file(options.results, options)
     with contextlib.closing(RunCheckpoints(options.run, read_only=True)) as checkpoints:
         step, digest = checkpoints.identify(options.step)
-    conditions = {"step": step, "digest": digest, **conditions_of(options, experiment)}
-    results = read_results(file) if file.exists() else []
+    conditions = conditions_of(options, experiment, step, digest)
+    folder, strips = options.results, options.results / "strips" / conditions.name
+    results = read_results(folder)
     finished = finished_tasks(results, conditions, episodes) if options.skip_finished else set()
     missing = [name for name in tasks if name not in finished]
     if missing:
-        require_writable(options.results)
+        require_writable(folder)
         policy = dsvla_jax.policy.load(options.run, decoding=Decoding(options.choice), step=step)
         if options.keypoints and not policy.config.encoding.use_keypoints:
             raise UserError(f"{options.run}: trained without keypoints; leave out --keypoints {options.keypoints}")
         for name in missing:
-            endings = evaluate_task(policy, experiment, name, episodes, options)
+            outcomes = evaluate_task(policy, experiment, name, episodes, options)
             fresh = [
-                EpisodeResult(
-                    name, i, options.physics, e.success, e.reason, e.keyframes, e.instruction, e.answers, conditions
-                )
-                for i, e in enumerate(endings)
+                EpisodeResult(name, i, one.success, one.reason, one.keyframes, one.instruction, one.answers, conditions)
+                for i, one in enumerate(outcomes)
             ]
-            results, displaced = merge_results(results, fresh)
-            set_aside(file, options, displaced)
-            write_results(file, results)
-            save_strips(file, name, endings)
+            results = merge_results(results, fresh)
+            write_results(folder, results)
+            save_strips(strips, name, outcomes)
     else:
-        print(f"{file} holds {episodes} episodes of each task at step {step}: nothing to do")
-    print_table([result for result in results if result.task in tasks])
-    report = file.with_suffix(".html")
-    if missing or not report.exists():
-        other = results_file(options.results, dataclasses.replace(options, physics=other_physics(options.physics)))
-        strips = load_strips(file, results)
-        write_report(report, results, strips, read_results(other) if other.exists() else None, title=str(options.run))
+        print(f"{folder} holds {episodes} episodes of each task at step {step}: nothing to do")
+    shown = latest(results, conditions.__eq__)
+    print_table([result for result in shown if result.task in tasks])
+    other = dataclasses.replace(conditions, physics="mjx" if options.physics == "mujoco" else "mujoco", loop="host")
+    report = folder / "report.html"
+    write_report(
+        report, shown, load_strips(strips, shown), latest(results, other.__eq__) or None, title=str(options.run)
+    )
     print(f"report: {report}")
 
 
-def results_file(folder: Path, options: Options, step: object = None) -> Path:
-    """Where the results of these conditions are kept; the physics alone name the plain ones. step: overrides --step."""
-    keypoints = f"-keypoints-{options.keypoints}" if options.keypoints else ""
-    noise = f"-keypoint-noise-{options.keypoint_noise:g}" if options.keypoint_noise else ""
-    shifts = "".join(f"-{name}" for name in check_shifts(options.shift))
-    choice = f"-{options.choice}" if options.choice != "greedy" else ""
-    seed = f"-seed-{options.seed}" if options.seed else ""
-    step = options.step if step is None else step
-    at = f"-step-{step}" if step is not None else ""
-    return folder / f"{options.physics}{keypoints}{noise}{shifts}{choice}{seed}{at}.jsonl"
+def conditions_of(options: Options, experiment: Experiment, step: int, digest: str) -> Conditions:
+    """The conditions of an evaluation. step, digest: of the checkpoint."""
+    return Conditions(
+        step=step,
+        digest=digest,
+        physics=options.physics,
+        loop=options.loop,
+        keypoints=options.keypoints or experiment.keypoints,
+        keypoint_noise=options.keypoint_noise,
+        shifts=check_shifts(options.shift),
+        seed=options.seed,
+        choice=options.choice,
+        image_size=experiment.data.image_size,
+    )
 
 
-def other_physics(physics: str) -> str:
-    """The kind of physics to compare with."""
-    return "mjx" if physics == "mujoco" else "mujoco"
+def compared(run: Path, options: Options) -> list[EpisodeResult]:
+    """The results of a run under the conditions that the options name, of each task the latest.
 
-
-def conditions_of(options: Options, experiment: Experiment) -> dict[str, Any]:
-    """What an episode's outcome depends on besides the checkpoint and its own number."""
-    return {
+    Raises UserError if there are none.
+    """
+    folder = options.results if run == options.run else run / "eval"
+    wanted = {
         "physics": options.physics,
-        "keypoints": options.keypoints or experiment.keypoints,
+        "loop": options.loop,
         "keypoint_noise": options.keypoint_noise,
-        "shifts": list(check_shifts(options.shift)),
+        "shifts": check_shifts(options.shift),
         "seed": options.seed,
         "choice": options.choice,
-        "image_size": experiment.data.image_size,
+        **({"keypoints": options.keypoints} if options.keypoints else {}),
+        **({"step": options.step} if isinstance(options.step, int) else {}),
     }
+    results = latest(read_results(folder), lambda found: wanted.items() <= vars(found).items())
+    if not results:
+        raise UserError(f"{folder}: no results under these conditions; evaluate first: python eval.py {run}")
+    return results
 
 
-def finished_tasks(results: Sequence[EpisodeResult], conditions: dict[str, Any], episodes: int) -> set[str]:
-    """The tasks that have so many episodes under these conditions."""
-    measured = {(result.task, result.seed) for result in results if result.conditions == conditions}
-    return {task for task, _ in measured if all((task, seed) in measured for seed in range(episodes))}
-
-
-def set_aside(file: Path, options: Options, displaced: Sequence[EpisodeResult]) -> None:
-    """Moves results and film strips of other checkpoints to the files that --step names."""
-    for step in dict.fromkeys(result.conditions.get("step", "unknown") for result in displaced):
-        theirs = [result for result in displaced if result.conditions.get("step", "unknown") == step]
-        target = results_file(file.parent, options, step)
-        if target == file:
-            continue  # the run was trained anew: no checkpoint has these results any more
-        merged, _ = merge_results(read_results(target) if target.exists() else [], theirs)
-        write_results(target, merged)
-        target.with_suffix("").mkdir(exist_ok=True)
-        for result in theirs:
-            strip = strip_file(file, result.task, result.seed)
-            if strip.exists():
-                strip.replace(strip_file(target, result.task, result.seed))
-
-
-def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: int, options: Options) -> list[Ending]:
+def evaluate_task(
+    policy: Policy, experiment: Experiment, name: str, episodes: int, options: Options
+) -> list[EpisodeOutcome]:
     """All episodes of one task, ``options.batch`` of them side by side."""
     environment = Environment(
         name, physics=options.physics, image_size=experiment.data.image_size, shifts=options.shift
     )
+    on_device = options.loop == "device"
     return run_task(
         environment,
-        policy.act,
+        DeviceLoop(environment, policy) if on_device else on_host(environment, policy.act),
         episodes,
         split="eval",
         seed=options.seed,
@@ -216,22 +212,24 @@ def evaluate_task(policy: Policy, experiment: Experiment, name: str, episodes: i
     )
 
 
-def strip_file(file: Path, task: str, seed: int) -> Path:
-    """Where the film strip of an episode is, beside the file of its result."""
-    return file.with_suffix("") / f"{task}-{seed}.png"
+def strip_file(folder: Path, task: str, episode: int) -> Path:
+    """Where the film strip of an episode is."""
+    return folder / f"{task}-{episode}.png"
 
 
-def save_strips(file: Path, task: str, endings: Sequence[Ending]) -> None:
-    """Writes the film strip of every episode beside the results, each target marked in the frame it was answered to."""
-    file.with_suffix("").mkdir(parents=True, exist_ok=True)
-    for i, ending in enumerate(endings):
-        marked = [mark_targets(f, t, ending.camera) for f, t in zip(ending.frames, ending.targets, strict=False)]
-        write_picture(strip_file(file, task, i), film_strip([*marked, ending.frames[-1]]))
+def save_strips(folder: Path, task: str, outcomes: Sequence[EpisodeOutcome]) -> None:
+    """Writes the film strip of every episode, each target marked in the frame it was answered to."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, outcome in enumerate(outcomes):
+        *seen, last = outcome.frames
+        # The loop on the device keeps the last view alone.
+        marked = [mark_targets(f, t, outcome.camera) for f, t in zip(seen, outcome.targets, strict=bool(seen))]
+        write_picture(strip_file(folder, task, i), film_strip([*marked, last]))
 
 
-def load_strips(file: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str, int], list[np.ndarray]]:
+def load_strips(folder: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str, int], list[np.ndarray]]:
     """The film strips of the results that have one, as `write_report` takes them."""
-    paths = {(r.task, r.seed): strip_file(file, r.task, r.seed) for r in results}
+    paths = {(r.task, r.episode): strip_file(folder, r.task, r.episode) for r in results}
     pictures = {key: cv2.imread(str(path)) for key, path in paths.items() if path.exists()}
     return {key: [picture[..., ::-1]] for key, picture in pictures.items() if picture is not None}
 

@@ -42,7 +42,7 @@ from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.rollout import Stopped, run_task
+from dsvla_jax.evaluation.loop import Stopped, on_host, run_task
 from dsvla_jax.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.variables import Variables, join_variables
@@ -260,7 +260,7 @@ def make_evaluation(
             try:
                 endings = run_task(
                     environments[name],
-                    policy.act,
+                    on_host(environments[name], policy.act),
                     experiment.evaluation.episodes_while_training,
                     split="validation",
                     seed=experiment.data.seed,

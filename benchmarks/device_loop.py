@@ -20,8 +20,9 @@ import dsvla_jax.policy
 from benchmarks._timing import timed
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.encoding.prompts import format_answer
-from dsvla_jax.evaluation.device_rollout import DeviceRollout, Rollout
-from dsvla_jax.evaluation.rollout import Ending, run_episodes
+from dsvla_jax.evaluation.device_loop import DeviceLoop, Rollout
+from dsvla_jax.evaluation.loop import run_episodes
+from dsvla_jax.evaluation.outcome import EpisodeOutcome
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.perception.simulator import Keypoints, keypoint_source
 from dsvla_jax.policy import Policy
@@ -42,7 +43,7 @@ class Options:
     batches: tuple[int, ...] = (4, 16)
 
 
-def agreeing(policy: Policy, endings: list[Ending], rollout: Rollout) -> int:
+def agreeing(policy: Policy, endings: list[EpisodeOutcome], rollout: Rollout) -> int:
     """Episodes that are the same in both."""
     integers, keyframes = np.asarray(rollout.integers), np.asarray(rollout.keyframes)
     succeeded, style = np.asarray(rollout.state.verdict.succeeded), policy.config.encoding.style
@@ -65,14 +66,14 @@ def main(options: Options) -> int:
     different = 0
     for task in options.tasks:
         environment = Environment(task, "mjx", image_size=experiment.data.image_size)
-        on_device = DeviceRollout(environment, policy)
+        on_device = DeviceLoop(environment, policy)
         for batch in options.batches:
             state = environment.reset(episode_keys(0, "eval", task, 0, batch))
             keypoints = first_keypoints(environment, state, experiment.keypoints)
             find = keypoint_source(experiment.keypoints, environment)
             from_host = partial(run_episodes, environment, policy.act, state, find_keypoints=find and find(state))
             endings, host_times = timed(from_host, REPEATS)
-            rollout, device_times = timed(partial(on_device, state, keypoints), REPEATS)
+            rollout, device_times = timed(partial(on_device.rollout, state, keypoints), REPEATS)
             device, host = min(device_times.later), min(host_times.later)
             same = agreeing(policy, endings, rollout)
             different += batch - same

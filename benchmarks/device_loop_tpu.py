@@ -23,7 +23,7 @@ from configs.paper_7b import config as paper_7b
 from dsvla_jax.command_line import fail_with_message
 from dsvla_jax.encoding.prompt_table import instruction_tokens
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
-from dsvla_jax.evaluation.device_rollout import device_loop
+from dsvla_jax.evaluation.device_loop import device_loop
 from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.vla import initialize

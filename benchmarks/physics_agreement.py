@@ -5,21 +5,24 @@ Usage: python -m benchmarks.physics_agreement [RUN]. Evaluates what has not been
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
-from dsvla_jax.evaluation.report import compare_physics, read_results
+from dsvla_jax.evaluation.results import compare_physics, latest, read_results
 
 
 def main(run: Path) -> int:
-    sets = []
     for physics in ("mujoco", "mjx"):
         subprocess.run([sys.executable, "eval.py", str(run), "--physics", physics, "--skip-finished"], check=True)
-        sets.append(read_results(run / "eval" / f"{physics}.jsonl"))
-    tasks = compare_physics(*sets).tasks
-    for name, one, _, only_first, only_second in tasks:
-        print(f"{name:24} {one.trials - only_first - only_second} of {one.trials} agree")
-    episodes = sum(one.trials for _, one, *_ in tasks)
-    total = 1 - sum(only_first + only_second for *_, only_first, only_second in tasks) / episodes
+    results = read_results(run / "eval")
+    in_c = latest(results, lambda conditions: conditions == replace(conditions, physics="mujoco"))
+    in_mjx = latest(results, lambda conditions: conditions == replace(conditions, physics="mjx", loop="host"))
+    tasks = compare_physics(in_c, in_mjx).tasks
+    for row in tasks:
+        trials = row.first.trials
+        print(f"{row.task:24} {trials - row.only_first - row.only_second} of {trials} agree")
+    episodes = sum(row.first.trials for row in tasks)
+    total = 1 - sum(row.only_first + row.only_second for row in tasks) / episodes
     print(f"agreement {total:.3f} over {episodes} episodes (at least 0.90)")
     return int(total < 0.90)
 

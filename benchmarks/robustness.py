@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.evaluation.rollout import failure_reasons
+from dsvla_jax.evaluation.outcome import failure_reasons
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys

@@ -17,7 +17,7 @@ import tyro
 import dsvla_jax.policy
 from benchmarks._server import server_process
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.evaluation.rollout import run_episodes
+from dsvla_jax.evaluation.loop import run_episodes
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.sim.environment import Environment

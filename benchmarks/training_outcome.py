@@ -6,11 +6,12 @@ Usage: python -m benchmarks.training_outcome [RUN]
 import sys
 from pathlib import Path
 
-from dsvla_jax.evaluation.report import macro_mean, print_table, read_results, success_rates
+from dsvla_jax.evaluation.report import print_table
+from dsvla_jax.evaluation.results import latest, macro_mean, read_results, success_rates
 
 
 def main(run: Path) -> int:
-    results = read_results(run / "eval" / "mujoco.jsonl")
+    results = latest(read_results(run / "eval"), lambda conditions: conditions.physics == "mujoco")
     print_table(results)
     rates = success_rates(results)
     mean, lowest = macro_mean(rates), min(rate.rate for rate in rates)

@@ -15,7 +15,7 @@ import tyro
 
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.report import film_strip
+from dsvla_jax.evaluation.pictures import film_strip
 from dsvla_jax.files import write_picture
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys

@@ -6,7 +6,7 @@ import numpy as np
 
 from dsvla_jax.command_line import configure_jax
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.evaluation.report import film_strip, mark_targets
+from dsvla_jax.evaluation.pictures import film_strip, mark_targets
 from dsvla_jax.files import write_picture
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys

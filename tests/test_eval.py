@@ -15,9 +15,10 @@ from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.command_line import require_each_option_once
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.errors import UserError
+from dsvla_jax.evaluation.conditions import Conditions
 from dsvla_jax.evaluation.demo import Options as DemoOptions
 from dsvla_jax.evaluation.demo import main as demo
-from dsvla_jax.evaluation.report import EpisodeResult, read_results, write_results
+from dsvla_jax.evaluation.results import EpisodeResult, read_results, write_results
 from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.vla import initialize
@@ -34,8 +35,9 @@ EXPERIMENT = Experiment(
     ModelConfig(small_vision(), small_language(TOKENIZER.vocab_size)),
     data=DataConfig(tasks=("lamp_on",), image_size=32, keypoints="oracle"),
 )
-# Rows as files of earlier versions have them, without conditions.
-OLD = [EpisodeResult(task, i, "mujoco", True, "", 2, "go", ["1"]) for task in ("lamp_on", "close_box") for i in (0, 1)]
+OLD = [
+    EpisodeResult(task, i, True, "", 2, "go", ["1"], Conditions()) for task in ("lamp_on", "close_box") for i in (0, 1)
+]
 
 
 INITIALIZE = jax.jit(lambda: initialize(EXPERIMENT.model, jax.random.key(0)))
@@ -57,34 +59,28 @@ def write_run(run: Path, experiment: Experiment = EXPERIMENT) -> Path:
 
 def evaluate(run: Path, **options: Any) -> list[EpisodeResult]:
     program.main(program.Options(run, batch=1, **options))
-    return read_results(run / "eval" / "mujoco.jsonl")
+    return read_results(run / "eval")
 
 
 def counts(results: list[EpisodeResult]) -> dict[tuple[str, Any], int]:
     """Episodes by task and step of the checkpoint."""
-    keys = [(result.task, result.conditions.get("step")) for result in results]
+    keys = [(result.task, result.conditions.step) for result in results]
     return {key: keys.count(key) for key in keys}
 
 
-def test_an_evaluation_replaces_the_results_of_its_task_alone_and_destroys_none(tmp_path: Path, capsys):
+def test_an_evaluation_destroys_no_results(tmp_path: Path, capsys):
     run = write_run(tmp_path / "run")
     save(run, 1)
-    file = run / "eval" / "mujoco.jsonl"
-    write_results(file, OLD)
+    file = run / "eval" / "results.jsonl"
+    write_results(run / "eval", OLD)
     results = evaluate(run, tasks=("lamp_on",), episodes=2)
-    assert counts(results) == {("lamp_on", 1): 2, ("close_box", None): 2}
-    assert read_results(run / "eval" / "mujoco-step-unknown.jsonl") == OLD[:2]
-    assert results[0].conditions["digest"]
-    assert {name: value for name, value in results[0].conditions.items() if name != "digest"} == {
-        "step": 1,
-        "physics": "mujoco",
-        "keypoints": "oracle",
-        "keypoint_noise": 0.0,
-        "shifts": [],
-        "seed": 0,
-        "choice": "greedy",
-        "image_size": 32,
-    }
+    assert results[:4] == OLD
+    assert counts(results[4:]) == {("lamp_on", 1): 2}
+    conditions = results[4].conditions
+    assert conditions.digest
+    assert conditions == Conditions(1, conditions.digest, "mujoco", "host", "oracle", 0.0, (), 0, "greedy", 32)
+    assert (run / "eval" / "strips" / conditions.name / "lamp_on-1.png").exists()
+    assert "step 1" in (run / "eval" / "report.html").read_text()
 
     # File times say nothing: the results are older than what follows, and of this checkpoint.
     (run / "metrics.jsonl").write_text("")
@@ -95,10 +91,8 @@ def test_an_evaluation_replaces_the_results_of_its_task_alone_and_destroys_none(
     assert file.read_bytes() == before
 
     save(run, 2)
-    results = evaluate(run, episodes=2, skip_finished=True)
-    assert counts(results) == {("lamp_on", 2): 2, ("close_box", None): 2}
-    assert counts(read_results(run / "eval" / "mujoco-step-1.jsonl")) == {("lamp_on", 1): 2}
-    assert (run / "eval" / "mujoco-step-1" / "lamp_on-1.png").exists()
+    results = evaluate(run, episodes=1, skip_finished=True)
+    assert counts(results) == {("lamp_on", None): 2, ("close_box", None): 2, ("lamp_on", 1): 2, ("lamp_on", 2): 1}
 
 
 def test_a_checkpoint_of_the_same_step_and_other_weights_is_another(tmp_path: Path):
@@ -133,16 +127,20 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_an_episode_is_run(
     (run / "eval").write_text("a file")
     with pytest.raises(UserError, match=r"eval: cannot write here .*; choose another place with --out"):
         program.main(program.Options(run, episodes=1))
-    assert "key pose" not in capsys.readouterr().err
+    assert "keyframe" not in capsys.readouterr().err
 
 
 def test_results_written_elsewhere_are_compared(tmp_path: Path, capsys):
-    write_results(tmp_path / "elsewhere" / "mujoco.jsonl", OLD[:1])
-    write_results(tmp_path / "other" / "eval" / "mujoco.jsonl", OLD[2:3])
+    write_results(tmp_path / "elsewhere", OLD[:1])
+    write_results(tmp_path / "other" / "eval", OLD[2:3])
     program.main(program.Options(tmp_path / "run", out=tmp_path / "elsewhere", compare=(tmp_path / "other",)))
     printed = capsys.readouterr().out
     assert "lamp_on" in printed
     assert "close_box" in printed
+    with pytest.raises(
+        UserError, match="run/eval: no results under these conditions; evaluate first"
+    ):
+        program.main(program.Options(tmp_path / "run", compare=(tmp_path / "other",)))
 
 
 @pytest.mark.parametrize("main", [lambda run: program.main(program.Options(run)), lambda run: demo(DemoOptions(run))])
@@ -167,6 +165,11 @@ def test_a_run_of_open_x_embodiment_does_not_act_in_the_simulator(tmp_path: Path
         ({"keypoint_noise": float("nan")}, "keypoint_noise: .* got nan"),
         ({"keypoint_noise": float("inf")}, "keypoint_noise: .* got inf"),
         ({"seed": -1}, "seed: expected at least 0, got -1"),
+        ({"loop": "device"}, "loop: expected 'host' with physics 'mujoco', got 'device'; add --physics mjx"),
+        (
+            {"loop": "device", "physics": "mjx", "keypoints": "segmentation-refresh"},
+            "loop: .* found before every keyframe",
+        ),
         ({"seed": 2**40}, "seed: expected at most 2147483647"),
     ],
 )

@@ -1,5 +1,4 @@
 import base64
-import dataclasses
 import html.parser
 import io
 import json
@@ -13,19 +12,19 @@ import scipy.stats
 from rich.console import Console
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.report import (
+from dsvla_jax.evaluation.conditions import Conditions
+from dsvla_jax.evaluation.pictures import film_strip, mark_targets
+from dsvla_jax.evaluation.report import print_comparison, print_table, write_report
+from dsvla_jax.evaluation.results import (
     EpisodeResult,
     checkpoints_of,
     compare_physics,
-    film_strip,
+    finished_tasks,
+    latest,
     macro_mean,
-    mark_targets,
     merge_results,
-    print_comparison,
-    print_table,
     read_results,
     success_rates,
-    write_report,
     write_results,
 )
 from dsvla_jax.evaluation.statistics import wilson_interval
@@ -52,27 +51,30 @@ def test_wilson_interval_at_its_ends_and_beyond():
         wilson_interval(8, 7)
 
 
-def result(task, seed, success, physics="mujoco", **changes):
+def result(task, episode, success, physics="mujoco", **changes):
     fields = {
         "reason": "" if success else "out of keyframes",
         "keyframes": 2,
         "instruction": "turn on the <lamp> & wait",
-        "actions": ["28 -1 140", "30 2 90"],
+        "answers": ["28 -1 140", "30 2 90"],
     }
-    return EpisodeResult(task=task, seed=seed, physics=physics, success=success, **{**fields, **changes})
+    conditions = Conditions(physics=physics, **changes)
+    return EpisodeResult(task=task, episode=episode, success=success, conditions=conditions, **fields)
 
 
 RESULTS = [result("lamp_on", seed, seed < 3) for seed in range(4)] + [result("lift_ball", 0, False)]
 
 
 def test_results_survive_the_file(tmp_path):
-    path = tmp_path / "eval" / "mujoco.jsonl"
-    write_results(path, RESULTS)
-    assert read_results(path) == RESULTS
-    assert len(path.read_text().splitlines()) == len(RESULTS)
+    shifted = [result("lamp_on", 0, True, shifts=("camera", "position"), keypoint_noise=0.1, step=3, digest="a")]
+    write_results(tmp_path / "eval", [*RESULTS, *shifted])
+    assert read_results(tmp_path / "eval") == [*RESULTS, *shifted]
+    path = tmp_path / "eval" / "results.jsonl"
+    assert len(path.read_text().splitlines()) == len(RESULTS) + 1
     path.write_text(path.read_text() + '{"task": "lam')
-    with pytest.raises(UserError, match=r"mujoco\.jsonl, line 6"):
-        read_results(path)
+    with pytest.raises(UserError, match=r"results\.jsonl, line 7"):
+        read_results(tmp_path / "eval")
+    assert read_results(tmp_path / "nothing") == []
 
 
 def test_rates_count_every_task_the_same_in_the_mean():
@@ -91,10 +93,10 @@ def test_physics_are_compared_on_shared_episodes_only():
     other = [result("lamp_on", seed, seed > 0, "mjx") for seed in range(1, 9)]
     comparison = compare_physics(RESULTS, other)
     assert comparison.names == ("mujoco", "mjx")
-    ((task, first, second, only_first, only_second),) = comparison.tasks
-    assert (task, first.successes, second.successes, first.trials) == ("lamp_on", 2, 3, 3)
-    assert (only_first, only_second) == (0, 1)
-    assert [(one.seed, two.seed) for one, two in comparison.differing] == [(3, 3)]
+    (row,) = comparison.tasks
+    assert (row.task, row.first.successes, row.second.successes, row.first.trials) == ("lamp_on", 2, 3, 3)
+    assert (row.only_first, row.only_second) == (0, 1)
+    assert [(one.episode, two.episode) for one, two in comparison.differing] == [(3, 3)]
 
 
 def test_targets_are_drawn_where_the_camera_sees_them():
@@ -194,33 +196,47 @@ def test_names_of_runs_and_tasks_are_told_apart_on_a_narrow_terminal(width: int)
 AT_ONE, AT_TWO = {"step": 1, "digest": "a"}, {"step": 2, "digest": "b"}
 
 
-def test_results_of_other_tasks_and_further_episodes_stay():
-    earlier = [result(task, seed, True, conditions=AT_ONE) for task in ("lamp_on", "close_box") for seed in range(3)]
-    fresh = [result("lamp_on", 0, False, conditions=AT_ONE), result("lift_ball", 0, True, conditions=AT_ONE)]
-    merged, displaced = merge_results(earlier, fresh)
-    assert merged == [fresh[0], *earlier[1:], fresh[1]]
-    assert displaced == []
+def test_a_result_replaces_the_one_of_its_episode_and_conditions_alone():
+    earlier = [result(task, episode, True, **AT_ONE) for task in ("lamp_on", "close_box") for episode in range(3)]
+    fresh = [
+        result("lamp_on", 0, False, **AT_ONE),
+        result("lift_ball", 0, True, **AT_ONE),
+        result("lamp_on", 1, False, **AT_TWO),
+        result("lamp_on", 2, False, shifts=("camera",), **AT_ONE),
+    ]
+    assert merge_results(earlier, fresh) == [*earlier[1:], *fresh]
 
 
-def test_results_of_another_checkpoint_are_displaced_task_by_task():
-    without = [result("lamp_on", seed, True) for seed in range(3)]
-    others = [result("close_box", 0, True, conditions=AT_ONE)]
-    fresh = [result("lamp_on", 0, False, conditions=AT_TWO)]
-    merged, displaced = merge_results([*without, *others], fresh)
-    assert (merged, displaced) == ([*fresh, *others], without)
-    assert checkpoints_of(merged) == "step 2: lamp_on; step 1: close_box"
-    assert checkpoints_of(fresh) == "step 2"
-    assert checkpoints_of(without) == ""
+def test_of_each_task_the_latest_matching_conditions_are_chosen():
+    old = [result(task, episode, True, **AT_ONE) for task in ("lamp_on", "close_box") for episode in (1, 0)]
+    new, shifted = result("lamp_on", 0, False, **AT_TWO), result("close_box", 0, True, shifts=("camera",), **AT_TWO)
+    chosen = latest([*old, new, shifted], lambda conditions: not conditions.shifts)
+    assert chosen == [new, old[3], old[2]]
+    assert checkpoints_of(chosen) == "step 2: lamp_on; step 1: close_box"
+    assert checkpoints_of([new]) == "step 2"
+    assert checkpoints_of(RESULTS) == ""
+    assert finished_tasks(old, Conditions(**AT_ONE), 2) == {"lamp_on", "close_box"}
+    assert finished_tasks(old, Conditions(**AT_ONE), 3) == finished_tasks(old, Conditions(**AT_TWO), 1) == set()
 
 
 def test_physics_are_compared_on_the_same_checkpoint_only():
-    one = [result("lamp_on", 0, True, conditions=AT_ONE)]
-    assert compare_physics(one, [result("lamp_on", 0, False, "mjx", conditions=AT_TWO)]).tasks == []
-    assert len(compare_physics(one, [result("lamp_on", 0, False, "mjx", conditions=AT_ONE)]).differing) == 1
+    one = [result("lamp_on", 0, True, **AT_ONE)]
+    assert compare_physics(one, [result("lamp_on", 0, False, "mjx", **AT_TWO)]).tasks == []
+    assert len(compare_physics(one, [result("lamp_on", 0, False, "mjx", **AT_ONE)]).differing) == 1
 
 
 def test_results_of_earlier_versions_are_read(tmp_path):
-    row = dataclasses.asdict(RESULTS[0])
-    del row["conditions"]
-    (tmp_path / "mujoco.jsonl").write_text(json.dumps(row) + "\n")
-    assert read_results(tmp_path / "mujoco.jsonl") == RESULTS[:1]
+    """One file for each kind of conditions, with `seed` and `actions`; the earliest without conditions."""
+    plain = {"task": "lamp_on", "seed": 0, "physics": "mjx", "success": True, "reason": "", "keyframes": 2}
+    plain |= {"instruction": "turn on the <lamp> & wait", "actions": ["28 -1 140", "30 2 90"]}
+    known = {"step": 1, "digest": "a", "physics": "mjx", "keypoints": "oracle", "keypoint_noise": 0.0}
+    known |= {"shifts": [], "seed": 0, "choice": "greedy", "image_size": 96}
+    (tmp_path / "mjx.jsonl").write_text(json.dumps(plain) + "\n")
+    (tmp_path / "mjx-step-1.jsonl").write_text(json.dumps({**plain, "conditions": known}) + "\n")
+    new = result("lamp_on", 0, False)
+    write_results(tmp_path, [new])
+    assert read_results(tmp_path) == [
+        result("lamp_on", 0, True, "mjx", step=1, digest="a", keypoints="oracle", image_size=96),
+        result("lamp_on", 0, True, "mjx"),
+        new,
+    ]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.rollout import Stopped, run_episodes, run_task
+from dsvla_jax.evaluation.loop import Stopped, on_host, run_episodes, run_task
 from dsvla_jax.perception.simulator import SegmentationKeypoints
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
@@ -61,7 +61,8 @@ def test_a_task_is_run_in_batches_from_the_seeds_of_its_split():
         calls.append(len(instructions))
         return Action(jnp.asarray(poses[rows, m]), jnp.asarray(grippers[rows, m])), ["go"] * len(instructions)
 
-    endings = run_task(environment("lamp_on"), act, 3, split="validation", seed=11, batch=2)
+    lamp = environment("lamp_on")
+    endings = run_task(lamp, on_host(lamp, act), 3, split="validation", seed=11, batch=2)
     # The plans are those of these seeds in this order: from other starts they would not succeed.
     assert [ending.success for ending in endings] == [True] * 3
     assert calls == [2] * (2 * poses.shape[1]), "the last batch is filled up"
@@ -81,7 +82,7 @@ def test_an_episode_is_the_same_whatever_the_size_of_the_batch():
                 ""
             ] * batch
 
-        run_task(lamp, act, EPISODES, split="validation", batch=batch, keypoint_noise=0.1)
+        run_task(lamp, on_host(lamp, act), EPISODES, split="validation", batch=batch, keypoint_noise=0.1)
         return [turn for call in calls[:: 2 * lamp.expert_keyframes] for turn in call]
 
     in_twos, at_once = asked(2), asked(EPISODES)
@@ -92,9 +93,11 @@ def test_an_episode_is_the_same_whatever_the_size_of_the_batch():
 
 
 def test_no_episodes_are_no_evaluation():
+    lamp = environment("lamp_on")
+    run = on_host(lamp, follow(plan_of("lamp_on")))
     for episodes, batch in ((0, 2), (2, 0), (2, -3)):
         with pytest.raises(UserError, match="expected at least 1 of each"):
-            run_task(environment("lamp_on"), follow(plan_of("lamp_on")), episodes, split="validation", batch=batch)
+            run_task(lamp, run, episodes, split="validation", batch=batch)
 
 
 def test_episodes_are_given_up_after_a_key_pose():
@@ -104,8 +107,9 @@ def test_episodes_are_given_up_after_a_key_pose():
         asked.append(True)
         return len(asked) == 2
 
+    lamp = environment("lamp_on")
     with pytest.raises(Stopped):
-        run_task(environment("lamp_on"), follow(plan), EPISODES, split="validation", seed=11, stop=stop)
+        run_task(lamp, on_host(lamp, follow(plan)), EPISODES, split="validation", seed=11, stop=stop)
     assert len(asked) == 2
 
 

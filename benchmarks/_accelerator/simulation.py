@@ -18,7 +18,7 @@ from benchmarks._timing import call, timed
 from benchmarks.device_loop import first_keypoints
 from benchmarks.mjx_agreement import outcomes
 from configs import get_config
-from dsvla_jax.evaluation.device_rollout import DeviceRollout
+from dsvla_jax.evaluation.device_loop import DeviceLoop
 from dsvla_jax.experiment import Experiment, load_experiment
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import Policy, PolicyConfig
@@ -75,7 +75,7 @@ def device_loop(job: Job, task: str) -> None:
     state = starts(task, experiment.data.image_size, "eval", min(STARTS, max(job.sizes.episodes)))
     keypoints = first_keypoints(environment, state, experiment.keypoints)
     rollouts = {
-        count: partial(DeviceRollout(environment, policy, limit), *repeated((state, keypoints), count))
+        count: partial(DeviceLoop(environment, policy, limit).rollout, *repeated((state, keypoints), count))
         for count in job.sizes.episodes
     }
     # All at once, because their compiling takes far longer than they do.

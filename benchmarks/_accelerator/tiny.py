@@ -13,7 +13,7 @@ import train
 from benchmarks._accelerator.sections import Job, Size
 from configs import get_config
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.evaluation.report import macro_mean, read_results, success_rates
+from dsvla_jax.evaluation.results import macro_mean, read_results, success_rates
 from dsvla_jax.experiment import Experiment, load_experiment
 
 # The smallest options that have every part.
@@ -73,7 +73,7 @@ def tiny(job: Job) -> None:
     experiment: Experiment = load_experiment(run / "config.json")
     start = time.perf_counter()
     evaluation.main(evaluation.Options(run=run))
-    rates = success_rates(read_results(run / "eval" / "mujoco.jsonl"))
+    rates = success_rates(read_results(run / "eval"))
     job.note(
         success=macro_mean(rates),
         **{f"success_{rate.name}": rate.rate for rate in rates},

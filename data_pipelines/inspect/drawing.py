@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipelines.records import Frame
-from dsvla_jax.evaluation.report import mark_targets
+from dsvla_jax.evaluation.pictures import mark_targets
 from dsvla_jax.geometry.cameras import project, unproject
 from dsvla_jax.types import Camera
 

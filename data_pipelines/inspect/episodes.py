@@ -14,7 +14,7 @@ from data_pipelines.records import Episode, Frame, decode_frame
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.encoding.prompts import format_answer
-from dsvla_jax.evaluation.report import film_strip
+from dsvla_jax.evaluation.pictures import film_strip
 from dsvla_jax.geometry.rotations import rotation_distance
 
 UNITS = {

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from dsvla_jax.evaluation.report import write_html
+from dsvla_jax.evaluation.pages import write_html
 
 
 @dataclasses.dataclass(frozen=True)

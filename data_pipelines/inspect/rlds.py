@@ -30,7 +30,7 @@ from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.displacement import displace
 from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
-from dsvla_jax.evaluation.report import MAX_STRIP_FRAMES, film_strip
+from dsvla_jax.evaluation.pictures import MAX_STRIP_FRAMES, film_strip
 from dsvla_jax.types import Action, Picture, RobotState
 
 _VERSION = re.compile(r"\d+\.\d+\.\d+")

@@ -17,7 +17,7 @@ from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.features import RldsEpisode, image_format, is_number, is_text
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.errors import DataError
-from dsvla_jax.evaluation.report import MAX_STRIP_FRAMES, film_strip
+from dsvla_jax.evaluation.pictures import MAX_STRIP_FRAMES, film_strip
 
 LOOKED_AT = 50
 """Episodes, the first ones, that are read."""

@@ -18,8 +18,10 @@ from dsvla_jax.command_line import configure_jax, fail_with_message, parse_optio
 from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.report import mark_targets, png_data, require_writable, write_html
-from dsvla_jax.evaluation.rollout import run_episodes
+from dsvla_jax.evaluation.loop import run_episodes
+from dsvla_jax.evaluation.pages import png_data, write_html
+from dsvla_jax.evaluation.pictures import mark_targets
+from dsvla_jax.evaluation.results import require_writable
 from dsvla_jax.experiment import load_experiment, require_simulated
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.perception.simulator import keypoint_source

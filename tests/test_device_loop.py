@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from dsvla_jax.encoding.displacement import DisplacementScale
-from dsvla_jax.encoding.prompts import format_answer
-from dsvla_jax.evaluation.device_rollout import DeviceRollout
-from dsvla_jax.evaluation.rollout import run_episodes
+from dsvla_jax.evaluation.device_loop import DeviceLoop
+from dsvla_jax.evaluation.loop import run_episodes
 from dsvla_jax.perception.simulator import SegmentationKeypoints
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
@@ -23,21 +22,22 @@ def test_both_loops_give_the_same_episodes():
     source = SegmentationKeypoints(environment, state)
     found, problems = source(state, environment.observe(state))
     assert problems == [""] * 3
-    endings = run_episodes(environment, policy.act, state, limit=3, find_keypoints=source)
-    rollout = DeviceRollout(environment, policy, limit=3)(state, found)
-    style = policy.config.encoding.style
-    for i, ending in enumerate(endings):
-        assert rollout.keyframes[i] == ending.keyframes
-        answers = [format_answer(np.asarray(rollout.integers)[k, i], style) for k in range(ending.keyframes)]
-        assert answers == ending.answers
-        assert bool(rollout.state.verdict.succeeded[i]) == ending.success
-    assert len({answer for ending in endings for answer in ending.answers}) > 1
+    noise = np.random.default_rng(0).uniform(-0.05, 0.05, found.shape)
+    options = {"first": 2, "noise": noise, "find_keypoints": source}
+    on_host = run_episodes(environment, policy.act, state, limit=3, **options)
+    on_device = DeviceLoop(environment, policy, limit=3)(state, **options)
+    for one, other in zip(on_host, on_device, strict=True):
+        for field in ("success", "reason", "keyframes", "instruction", "answers"):
+            assert getattr(one, field) == getattr(other, field)
+        np.testing.assert_allclose(one.targets, other.targets, atol=1e-6)
+        np.testing.assert_array_equal(one.frames[-1], other.frames[-1])
+    assert len({answer for outcome in on_host for answer in outcome.answers}) > 1
 
 
 def test_what_only_the_host_loop_can_do_is_refused():
     environment, policy = Environment("lamp_on", image_size=SIZE), tiny_policy()
     with pytest.raises(ValueError, match=r"expected Environment.*physics='mjx'"):
-        DeviceRollout(environment, policy)
+        DeviceLoop(environment, policy)
     config = dataclasses.replace(policy.config, displacement=DisplacementScale((-1.0,) * 6, (1.0,) * 6))
-    with pytest.raises(ValueError, match=r"answers with displacements; run it with rollout\.run_episodes"):
-        DeviceRollout(environment, dataclasses.replace(policy, config=config))
+    with pytest.raises(ValueError, match=r"answers with displacements; use the loop on the host: --loop host"):
+        DeviceLoop(environment, dataclasses.replace(policy, config=config))
