@@ -11,7 +11,7 @@ from jaxtyping import install_import_hook
 import tests.shape_checks  # noqa: F401  (the hook looks it up by name)
 
 # Before any test imports one of these modules.
-CHECKED = ["dsvla_jax.types", "dsvla_jax.encoding", "dsvla_jax.geometry", "data_pipelines.records"]
+CHECKED = ["dsvla_jax.types", "dsvla_jax.encoding.encode", "dsvla_jax.geometry", "data_pipelines.records"]
 install_import_hook(CHECKED, "tests.shape_checks.check")
 
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".cache" / "xla"))
