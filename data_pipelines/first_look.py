@@ -30,7 +30,7 @@ TARGET = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
 def look_at_demonstrations(reader: EpisodeReader, encoding: EncodingConfig) -> str:
     """One line about a folder. Raises UserError where a task's pictures or camera are none, or its cloud is empty."""
     frames = frames_of(reader)
-    targets = [np.concatenate([x["target_pose"], x["target_gripper"][:, None]], axis=1) for x in frames]
+    targets = [np.concatenate([x.target.pose, x.target.gripper_open[:, None]], axis=1) for x in frames]
     said = [say_words(reader), say_components(targets)]
     if encoding.use_points:
         counts = [require_points(f"{reader.folder}, {task}", views, encoding) for task, views in views_of(frames)]
@@ -128,12 +128,12 @@ def dataset_views(opened: "OpenDataset") -> list[View]:
         for place in np.unique(np.linspace(0, len(samples) - 1, LOOKED_AT // EPISODES).astype(int)):
             sample = samples[place]
             try:
-                seen = write_picture(sample, np.random.default_rng(0), config, True, rgb)
+                depth, camera = write_picture(sample, np.random.default_rng(0), config, True, rgb)
             except DataError:
                 if not config.skip_bad:
                     raise
                 continue
-            views.append(View(seen["depth"], seen["intrinsics"], seen["world_from_camera"], sample.pose[:, :3]))
+            views.append(View(depth, camera.intrinsics, camera.world_from_camera, sample.pose[:, :3]))
     if not views:
         fix = "look at its records"
         raise DataError(opened.build.folder, "depth", "some samples that can be decoded", "none", fix)

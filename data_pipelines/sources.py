@@ -89,7 +89,7 @@ def require_data_fits(
         reader, name = _open_folder(data, tokenizer), data.folder
         if held_out:
             open_held_out(data, tokenizer, held_out)
-        height, width = reader.frame(0)["depth"].shape
+        height, width = reader.frame(0).picture.depth.shape
         picture = (height, width)
         texts = [(text, min(reader.num_arms.values())) for text in reader.instructions]
     encoding.require_points(*picture, f"a picture of {name}")
