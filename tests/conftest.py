@@ -1,8 +1,18 @@
-"""One persistent compilation cache for the whole suite: what a test compiles once, no later run compiles again."""
+"""One persistent compilation cache for the whole suite: what a test compiles once, no later run compiles again.
+
+And run-time checks of types and shapes: of what the structs hold, and of what the functions around them take and give.
+"""
 
 from pathlib import Path
 
 import jax
+from jaxtyping import install_import_hook
+
+import tests.shape_checks  # noqa: F401  (the hook looks it up by name)
+
+# Before any test imports one of these modules.
+CHECKED = ["dsvla_jax.types", "dsvla_jax.encoding.encode", "dsvla_jax.geometry", "data_pipelines.records"]
+install_import_hook(CHECKED, "tests.shape_checks.check")
 
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".cache" / "xla"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

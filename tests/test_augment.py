@@ -3,6 +3,7 @@
 import copy
 from dataclasses import fields, replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from tests.random_data import random_episode
 
 def arrays_of(frame):
     """All fields of a frame, and those of their fields, by name."""
-    return named_arrays({field.name: getattr(frame, field.name) for field in fields(frame)})
+    return named_arrays({field.name: jax.tree.map(np.asarray, getattr(frame, field.name)) for field in fields(frame)})
 
 
 def project(points, frame):

@@ -155,7 +155,7 @@ def _section(opened: OpenDataset, number: int, encoding: EncodingConfig, scale: 
     """One episode."""
     episode = opened.parse(number)
     samples = opened.read(number)
-    chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_STRIP_FRAMES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_STRIP_FRAMES).round().astype(int)).tolist()
     frames = [_frame(samples[i], i, opened.config) for i in chosen]
     pictures = [frame.picture.rgb if samples[0].camera is None else draw_frame(frame) for frame in frames]
     caption = f"{len(chosen)} of {len(samples)} samples, cut and coloured as training may see them"

@@ -6,7 +6,7 @@ import json
 import pathlib
 import re
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,6 +18,7 @@ _SPECIAL = ("<pad>", "<unk>", "<s>", "</s>")
 _FILE_FORMAT = "dsvla_jax word tokenizer 1"
 
 
+@runtime_checkable
 class Tokenizer(Protocol):
     """What the policy asks of a tokenizer. Hashable, equal where the vocabulary is.
 
