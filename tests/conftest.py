@@ -1,5 +1,8 @@
 """One persistent compilation cache for the whole suite: what a test compiles once, no later run compiles again.
 
+Tests spend most of their time compiling, so XLA leaves most optimisations out here. The programs that tests start in
+processes of their own are compiled as a user's.
+
 And run-time checks of types and shapes: of what the structs hold, and of what the functions around them take and give.
 """
 
@@ -17,3 +20,4 @@ install_import_hook(CHECKED, "tests.shape_checks.check")
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".cache" / "xla"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+jax.config.update("jax_disable_most_optimizations", True)
