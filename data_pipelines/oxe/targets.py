@@ -50,8 +50,8 @@ def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targ
 
     With a horizon, the target of step t is step t + horizon, or the last one; with key frames, the next key frame. Its
     displacement is that between reached poses if the dataset records poses, else the composition of the commands in
-    between. The target's gripper is the command that holds there (of the last but one step at the end, where the last step's
-    command was never carried out).
+    between. The target's gripper is the command that holds there (of the last but one step at the end, where the last
+    step's command was never carried out).
     """
     if reason := why_unsupported(dataset, config):
         raise UserError(f"{dataset.name}: cannot give {config.target} targets: {reason}; leave it out of the mixture")
