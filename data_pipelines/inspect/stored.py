@@ -14,7 +14,7 @@ from data_pipelines.oxe.index import main_view
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild
-from data_pipelines.rlds.features import RldsEpisode, image_format, is_number, is_text
+from data_pipelines.rlds.features import RldsEpisode, dtype_of, image_format, is_number, is_text, shape_of
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.errors import DataError
 from dsvla_jax.evaluation.pictures import MAX_STRIP_FRAMES, film_strip
@@ -29,11 +29,11 @@ def feature_table(build: RldsBuild) -> Table:
     """Every feature with its type and shape."""
 
     def kind(feature: FeatureConnector) -> str:
-        dtype = np.dtype(feature.np_dtype)
+        dtype = dtype_of(feature)
         return "text" if is_text(feature) else f"picture, {dtype}" if isinstance(feature, Image) else str(dtype)
 
     rows = [
-        (path, kind(feature), " x ".join("any" if size is None else str(size) for size in feature.shape))
+        (path, kind(feature), " x ".join("any" if size is None else str(size) for size in shape_of(feature)))
         for path, feature in _features(build)
     ]
     return Table("features of an episode", ("feature", "type", "shape"), rows, numbers=False)

@@ -288,7 +288,7 @@ def _report_other_versions(path: Path, dataset: OxeDataset, config: OxeConfig) -
 
 
 def _pack(index: Index) -> dict[str, Json]:
-    def plain(value: object) -> Json:
+    def plain(value: Any) -> Json:  # noqa: ANN401, any field of an Index
         if isinstance(value, np.ndarray):
             return value.tolist()
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value

@@ -94,7 +94,9 @@ class OxeLoader(Iterator[Example[np.ndarray]]):
             if then.get(part) != now[part]:
                 fix = "put the same data back, or start a new run"
                 raise DataError("saved position", part, str(then.get(part)), str(now[part]), fix)
-        self._batches.set_state(state["position"])
+        position = state["position"]
+        assert isinstance(position, dict)
+        self._batches.set_state(position)
 
 
 class _Batches(grain.sources.RandomAccessDataSource[list[tuple[int, EncodedSample]]]):

@@ -14,7 +14,7 @@ PerAct2; ``rlbench/backend/utils.py`` for how depth is packed into PNG.
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import SupportsIndex
+from typing import SupportsIndex, cast
 
 import cv2
 import numpy as np
@@ -120,17 +120,18 @@ def left_aside(folder: Path, camera: str) -> list[str]:
     return sorted(kinds - {f"{camera}_rgb", f"{camera}_depth"})
 
 
-def _check_camera_name(camera: str, misc: Mapping[str, object], path: Path) -> None:
+def _check_camera_name(camera: str, misc: object, path: Path) -> None:
     ending = "_camera_extrinsics"
-    cameras = sorted(name.removesuffix(ending) for name in misc if name.endswith(ending))
-    if cameras and not any(name.startswith(f"{camera}_camera_") for name in misc):
+    names = [str(name) for name in misc] if isinstance(misc, dict) else []
+    cameras = sorted(name.removesuffix(ending) for name in names if name.endswith(ending))
+    if cameras and not any(name.startswith(f"{camera}_camera_") for name in names):
         raise DataError(path, "camera", f"one of {', '.join(cameras)}", repr(camera), "choose one with --camera")
 
 
 def _field(record: object, name: str, number: int, path: Path) -> object:
     """An attribute of a pickled object or an entry of a pickled dict."""
     try:
-        return record.field(name) if isinstance(record, Node) else record[name]
+        return record.field(name) if isinstance(record, Node) else cast(Mapping[str, object], record)[name]
     except (KeyError, TypeError) as error:
         raise DataError(path, f"observation {number}: {name}", "to be recorded", "nothing", _FIX) from error
 
@@ -214,7 +215,8 @@ class _Pictures(Sequence[np.ndarray]):
     def __len__(self) -> int:
         return self.total
 
-    def __getitem__(self, number: SupportsIndex) -> np.ndarray:
+    # Nobody takes slices.
+    def __getitem__(self, number: SupportsIndex) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
         if int(number) not in self.names:
             raise self._missing(int(number))
         return read_png(self.folder / self.names[int(number)])
@@ -229,7 +231,8 @@ class _DepthMaps(_Pictures):
         super().__init__(folder, name, count, key_poses_only)
         self.near, self.far = near, far
 
-    def __getitem__(self, number: SupportsIndex) -> np.ndarray:
+    # Nobody takes slices.
+    def __getitem__(self, number: SupportsIndex) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
         near, far = float(self.near[number]), float(self.far[number])
         depth = unpack_depth(super().__getitem__(number), near, far)
         # At the far plane nothing was hit.

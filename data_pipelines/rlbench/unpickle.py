@@ -142,9 +142,10 @@ def _array(data: object, dtype: Node, shape: tuple[int, ...], order: str) -> np.
             data = b""
     if not isinstance(data, bytes | bytearray):
         raise ValueError(f"an array of {type(data).__name__}")
-    if dtype.name != "dtype" or not dtype.args or dtype.args[0] not in _DTYPES:
+    code = dtype.args[0] if dtype.name == "dtype" and dtype.args else None
+    if not isinstance(code, str) or code not in _DTYPES:
         raise ValueError(f"an array of {dtype.args[:1] if dtype.args else dtype.name}")
     byte_order = dtype.state[1] if isinstance(dtype.state, tuple) and len(dtype.state) > 1 else "="
-    kind = np.dtype(dtype.args[0]).newbyteorder(">" if byte_order == ">" else "<")
+    kind = np.dtype(code).newbyteorder(">" if byte_order == ">" else "<")
     array = np.frombuffer(data, kind).reshape(shape, order="F" if order == "F" else "C")
     return array.astype(kind.newbyteorder("="))

@@ -9,7 +9,7 @@ import json
 import os
 import re
 from functools import cached_property
-from typing import BinaryIO, Literal, Protocol
+from typing import Any, BinaryIO, Literal, Protocol
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from data_pipelines.rlds import files
 from data_pipelines.rlds.features import RldsEpisode, parse_features
 from data_pipelines.rlds.tfrecord import read_record, record_offsets
 from dsvla_jax.errors import DataError
-from dsvla_jax.json_values import Json
 
 Format = Literal["tfrecord", "array_record", "parquet"]
 FORMATS: tuple[Format, ...] = ("tfrecord", "array_record", "parquet")
@@ -194,7 +193,9 @@ class ParquetFile:
             except (self._error, OSError) as error:
                 where = f"{self.path}, record {number}"
                 raise DataError(where, "record", "readable bytes", str(error), "copy the file again") from error
-        return self._group[1][number - int(self._first[group])].as_py()
+        column = self._group[1]
+        assert column is not None
+        return column[number - int(self._first[group])].as_py()
 
     def close(self) -> None:
         """Closes the file."""
@@ -226,7 +227,8 @@ def _shard_name(template: str, dataset: str, split: str, suffix: str, number: in
     return re.sub(r"\{(\w+)\}", lambda match: values.get(match[1], match[0]), template)
 
 
-def _read_json(path: str) -> dict[str, Json]:
+def _read_json(path: str) -> dict[str, Any]:
+    # Any: what tfds wrote; whoever uses a value says what it should have been.
     try:
         value = json.loads(files.read_text(path))
     except ValueError as error:

@@ -8,6 +8,7 @@ import dataclasses
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -27,7 +28,6 @@ from dsvla_jax.errors import DataError
 from dsvla_jax.json_values import Json
 
 STEPS = "steps"
-Raw = bytes | int | float
 # Bytes within which a picture's end marker has to be: some writers pad.
 _TAIL = 64
 _FIX = "is features.json that of these records? Or leave bad records out with --skip-bad"
@@ -90,12 +90,12 @@ class RldsEpisode:
             raise DataError(
                 self.where, path, "at most one open dimension", repr(feature), "this reader leaves such features unread"
             )
-        dtype, values = np.dtype(feature.np_dtype), self._raw(path, feature)
+        dtype, values = dtype_of(feature), self._raw(path, feature)
         rows = self.num_steps if path.startswith(f"{STEPS}/") else 1
-        shape = (rows, *(-1 if size is None else size for size in feature.shape))
+        shape = (rows, *(-1 if size is None else size for size in shape_of(feature)))
         try:
             if _is_bytes(feature):
-                unzip = zlib.decompress if feature._encoding == Encoding.ZLIB else bytes
+                unzip = zlib.decompress if _encoding(feature) == Encoding.ZLIB else bytes
                 parts = [unzip(value) for value in values]
                 # Put together, steps of several lengths could still fill the shape.
                 if len(parts) != rows or len(set(map(len, parts))) > 1:
@@ -145,12 +145,12 @@ class RldsEpisode:
             raise DataError(self.where, path, "a feature of this build", "none of that name", f"it has: {near}")
         return self._features[path]
 
-    def _raw(self, path: str, feature: FeatureConnector) -> Sequence[Raw]:
-        """The values of a leaf as protobuf keeps them, of the kind that the feature tells."""
+    def _raw(self, path: str, feature: FeatureConnector) -> Any:  # noqa: ANN401, bytes or numbers
+        """The values of a leaf as protobuf keeps them, bytes or numbers as the feature says."""
         if path not in self._values:
             raise DataError(self.where, path, "to be present", "nothing", _FIX)
         values = self._values[path]
-        kind = "bytes_list" if _is_bytes(feature) else _kind(feature.np_dtype)
+        kind = "bytes_list" if _is_bytes(feature) else _kind(dtype_of(feature))
         found = values.WhichOneof("kind")
         if found is None:
             return ()
@@ -173,7 +173,7 @@ class ImageFormat:
 
 def image_format(feature: FeatureConnector, bgr: bool = False) -> ImageFormat:
     """The format of an Image feature."""
-    return ImageFormat(tuple(feature.shape), np.dtype(feature.np_dtype), bgr)
+    return ImageFormat(tuple(shape_of(feature)), dtype_of(feature), bgr)
 
 
 def decode_image(data: bytes, kind: ImageFormat, where: object) -> np.ndarray:
@@ -206,9 +206,19 @@ def _is_whole(data: bytes) -> bool:
     return b"\xff\xd9" in data[-_TAIL:] or b"IEND" in data[-_TAIL:]
 
 
+def shape_of(feature: FeatureConnector) -> tuple[int | None, ...]:
+    """The shape of a leaf, None for open dimensions; tfds' own type allows for trees."""
+    return cast(tuple[int | None, ...], feature.shape)
+
+
+def dtype_of(feature: FeatureConnector) -> np.dtype:
+    """The dtype of a leaf; tfds' own type allows for trees."""
+    return np.dtype(cast(type[np.generic], feature.np_dtype))
+
+
 def is_text(feature: FeatureConnector) -> bool:
     """Whether a feature holds strings."""
-    return _is_tensor(feature) and np.dtype(feature.np_dtype) == np.object_
+    return _is_tensor(feature) and dtype_of(feature) == np.object_
 
 
 def is_number(feature: FeatureConnector) -> bool:
@@ -216,25 +226,29 @@ def is_number(feature: FeatureConnector) -> bool:
     return _is_tensor(feature) and not is_text(feature)
 
 
+def _encoding(feature: FeatureConnector) -> Encoding:
+    return feature._encoding if isinstance(feature, Tensor) else Encoding.NONE
+
+
 def _is_tensor(feature: FeatureConnector) -> bool:
     return isinstance(feature, Tensor)
 
 
 def _values_a_step(feature: FeatureConnector) -> int:
-    return 1 if _is_bytes(feature) else int(np.prod(feature.shape, dtype=int))
+    return 1 if _is_bytes(feature) else int(np.prod(np.array(shape_of(feature), int)))
 
 
 def _is_bytes(feature: FeatureConnector) -> bool:
     """Whether a value is stored as one string of bytes."""
-    return isinstance(feature, Image) or is_text(feature) or feature._encoding != Encoding.NONE
+    return isinstance(feature, Image) or is_text(feature) or _encoding(feature) != Encoding.NONE
 
 
 def _is_simple(feature: FeatureConnector) -> bool:
     """Whether a value is stored under the feature's own name (several open dimensions take two names)."""
-    return isinstance(feature, Image) or feature.shape.count(None) <= (1 if _is_bytes(feature) else 0)
+    return isinstance(feature, Image) or shape_of(feature).count(None) <= (1 if _is_bytes(feature) else 0)
 
 
-def _list_of(values: tf_feature_pb2.Feature) -> Sequence[Raw] | None:
+def _list_of(values: tf_feature_pb2.Feature) -> Sequence[bytes | int | float] | None:
     kind = values.WhichOneof("kind")
     return None if kind is None else getattr(values, kind).value
 

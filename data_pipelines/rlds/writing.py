@@ -11,6 +11,7 @@ from array_record.python import array_record_module  # pyright: ignore[reportAtt
 from tensorflow_datasets.core.features import Dataset, FeatureConnector, FeaturesDict, Image
 
 from data_pipelines.rlds.build import Format
+from data_pipelines.rlds.features import dtype_of, shape_of
 from data_pipelines.rlds.tfrecord import write_records
 from dsvla_jax.files import whole_folder
 
@@ -41,6 +42,7 @@ def write_build(
     """
     build = folder / name / version
     described, stored = [], _stored(features)
+    assert isinstance(stored, FeaturesDict)
     with whole_folder(build) as partial:
         for split, episodes in splits.items():
             records = [stored.serialize_example(episode) for episode in episodes]
@@ -68,9 +70,8 @@ def _stored(feature: FeatureConnector) -> FeatureConnector:
         return Dataset(_stored(feature.feature))
     if isinstance(feature, FeaturesDict):
         return FeaturesDict({name: _stored(child) for name, child in feature.items()})
-    dtype, shape = np.dtype(feature.np_dtype), feature.shape
-    if dtype == np.float32 and isinstance(feature, Image):
-        return Image(shape=(*shape[:2], 4), encoding_format="png")
+    if isinstance(feature, Image) and dtype_of(feature) == np.float32:
+        return Image(shape=(*shape_of(feature)[:2], 4), encoding_format="png")
     return feature
 
 

@@ -23,7 +23,7 @@ from dsvla_jax.weights.backbones import import_backbones
 from dsvla_jax.weights.export import ExportOptions, export_run
 from dsvla_jax.weights.towers import summarize
 
-DTYPES = {"float32": np.float32, "bfloat16": jnp.bfloat16}
+DTYPES = {"float32": np.dtype(np.float32), "bfloat16": np.dtype(jnp.bfloat16)}
 
 
 def import_command(

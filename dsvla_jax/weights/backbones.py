@@ -78,7 +78,7 @@ def import_backbones(
         raise WeightsError(f"heads of the adapter's visual blocks: expected at least 1, got {adapter_heads}")
     if adapter is None and adapter_heads != VisualPromptConfig().heads:
         raise WeightsError("heads of the adapter's visual blocks need an adapter: name its file (--adapter)")
-    towers = {"language": read_language(source)}
+    towers: dict[str, Tower] = {"language": read_language(source)}
     if vision_source is not None:
         towers["vision"] = read_vision(vision_source, image_size, projection or adapter is not None)
     if adapter is not None:

@@ -6,7 +6,8 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Protocol
+from types import EllipsisType
+from typing import Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -40,12 +41,13 @@ ROWS = 2048
 
 TowerConfig = LanguageConfig | VisionConfig | VisualPromptConfig | LoraConfig
 """Sizes of what a checkpoint holds."""
+C = TypeVar("C", bound=TowerConfig)
 
 
 class Writable(Protocol):
     """An array in memory or on disk that takes values at an index."""
 
-    def __setitem__(self, index: tuple[int | slice, ...], values: np.ndarray, /) -> None: ...
+    def __setitem__(self, index: tuple[int | slice, ...] | EllipsisType, values: np.ndarray, /) -> None: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Piece:
 
 
 @dataclasses.dataclass(frozen=True)
-class Tower:
+class Tower(Generic[C]):
     """Parameters whose tensors are all there, and not read yet.
 
     config: sizes, for the vision tower and the language model. shapes: by path, layers stacked. computed: parameters
@@ -77,7 +79,7 @@ class Tower:
     otherwise than the checkpoint's config, and what is done about it.
     """
 
-    config: TowerConfig
+    config: C
     shapes: Mapping[str, tuple[int, ...]]
     pieces: tuple[Piece, ...]
     unused: tuple[str, ...]
@@ -100,7 +102,9 @@ class Tower:
                 piece.copy_to(arrays[piece.place[0]], dtype)
                 bar.update(math.prod(piece.tensor.shape))
 
-    def replaced(self, config: LanguageConfig, tensors: Mapping[Place, StoredTensor], source: Path) -> "Tower":
+    def replaced(
+        self, config: LanguageConfig, tensors: Mapping[Place, StoredTensor], source: Path
+    ) -> "Tower[LanguageConfig]":
         """The tower of ``config`` with some of its tensors from another file. Raises WeightsError as `assign` does."""
         shapes = tower_shapes(config)
         own = {piece.place: piece for piece in self.pieces}
@@ -110,7 +114,7 @@ class Tower:
         pieces = tuple(
             _piece(place, tensors[place], shapes, AXES) if place in tensors else own[place] for place in _places(shapes)
         )
-        return dataclasses.replace(self, config=config, shapes=shapes, pieces=pieces)
+        return Tower(config, shapes, pieces, self.unused, self.notes, self.computed)
 
     def require_equal(self, tensors: Mapping[Place, StoredTensor], source: Path) -> None:
         """Raises WeightsError where another file's tensors are not those at the same places, but for their rounding."""
@@ -132,7 +136,7 @@ class Tower:
 
 
 def assign(
-    config: TowerConfig,
+    config: C,
     shapes: Mapping[str, tuple[int, ...]],
     names: Mapping[str, str],
     tensors: Mapping[str, StoredTensor],
@@ -142,7 +146,7 @@ def assign(
     droppable: Collection[str] = (),
     notes: tuple[str, ...] = (),
     axes: Mapping[str, tuple[int, ...]] = AXES,
-) -> Tower:
+) -> Tower[C]:
     """The tower of ``config`` with parameters of ``shapes``. Every tensor is checked, and none is read.
 
     names: the checkpoint's name of each parameter, with {} where the number of the layer stands. prefix: what the names
@@ -195,10 +199,10 @@ def _piece(
     return Piece(place, tensor, order)
 
 
-def resample(tower: Tower, image_size: int, source: Path) -> Tower:
+def resample(tower: Tower[VisionConfig], image_size: int, source: Path) -> Tower[VisionConfig]:
     """The vision tower for images of another size. Raises WeightsError where it has no such size."""
     try:
-        config: VisionConfig = dataclasses.replace(tower.config, image_size=image_size)
+        config = dataclasses.replace(tower.config, image_size=image_size)
     except ValueError as error:
         raise WeightsError(f"image size {image_size} does not suit the tower in {source}: {error}") from error
     name = "positional_embedding"

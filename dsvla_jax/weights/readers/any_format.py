@@ -2,12 +2,13 @@
 
 from pathlib import Path
 
+from dsvla_jax.model.config import LanguageConfig, VisionConfig
 from dsvla_jax.weights.readers import gguf, hugging_face, llama_consolidated, openai_clip
 from dsvla_jax.weights.readers.peft import refuse_peft_adapter
 from dsvla_jax.weights.towers import Tower, resample
 
 
-def read_language(source: Path) -> Tower:
+def read_language(source: Path) -> Tower[LanguageConfig]:
     """The LLaMA decoder of a Hugging Face folder, one of Meta's (params.json), or a GGUF file.
 
     Raises WeightsError naming file and key where anything is missing, damaged, left over, or of another architecture.
@@ -20,7 +21,7 @@ def read_language(source: Path) -> Tower:
     return hugging_face.read_language(source)
 
 
-def read_vision(source: Path, image_size: int | None = None, projection: bool = False) -> Tower:
+def read_vision(source: Path, image_size: int | None = None, projection: bool = False) -> Tower[VisionConfig]:
     """The CLIP vision tower of a Hugging Face folder, or of one of OpenAI's files.
 
     image_size: pixels; None for the checkpoint's own. Positional embeddings are resampled to another size's grid.

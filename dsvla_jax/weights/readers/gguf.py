@@ -67,7 +67,7 @@ def _package() -> ModuleType:
     return gguf
 
 
-def read_language(file: Path) -> Tower:
+def read_language(file: Path) -> Tower[LanguageConfig]:
     """The LLaMA decoder of a GGUF file, its numbers dequantised as they are read.
 
     Raises WeightsError naming file and key where anything is missing, left over, damaged, or of another architecture.

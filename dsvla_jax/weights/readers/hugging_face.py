@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dsvla_jax.model.config import LanguageConfig, VisionConfig
 from dsvla_jax.model.llama import rotary_frequencies
 from dsvla_jax.weights.readers.hugging_face_config import read_language_config, read_vision_config
 from dsvla_jax.weights.readers.safetensors import list_tensors
@@ -54,7 +55,7 @@ CLIP_NAMES = {
 FREQUENCIES, POSITIONS = ".rotary_emb.inv_freq", "embeddings.position_ids"
 
 
-def read_language(folder: Path) -> Tower:
+def read_language(folder: Path) -> Tower[LanguageConfig]:
     """The LLaMA decoder of a folder: params of `dsvla_jax.model.llama.Llama`.
 
     Raises WeightsError naming file and key where anything is missing, left over within the decoder, of another shape
@@ -108,7 +109,7 @@ def _head_key(tensors: Iterable[str], prefix: str, folder: Path) -> str:
     return max(around, key=len, default=prefix.removesuffix("model.")) + LM_HEAD
 
 
-def read_vision(folder: Path, projection: bool = False) -> Tower:
+def read_vision(folder: Path, projection: bool = False) -> Tower[VisionConfig]:
     """The CLIP vision tower of a folder: params of `dsvla_jax.model.clip.VisionTower`.
 
     projection: read the projection into CLIP's joint embedding too, which only whole CLIP models have.

@@ -198,11 +198,12 @@ def _rope(section: Section) -> tuple[float, RopeScaling | None]:
 
 def _require_same_layers(section: Section) -> None:
     """Refuses layers that are not all alike, and code of the checkpoint's own."""
-    kinds = section.values.get("layer_types") or ()
+    kinds = section.values.get("layer_types") or []
+    kinds = kinds if isinstance(kinds, list) else [kinds]
     if other := sorted({repr(kind) for kind in kinds} - {"'full_attention'"}):
         raise WeightsError(f"{section.file}: layer_types: only 'full_attention' is supported, found {', '.join(other)}")
-    own = section.values.get("auto_map") or {}
-    if models := [str(name) for name in own if str(name).startswith("AutoModel")]:
+    own = section.values.get("auto_map")
+    if models := [name for name in (own if isinstance(own, dict) else ()) if name.startswith("AutoModel")]:
         raise WeightsError(
             f"{section.file}: auto_map: {', '.join(models)}: the checkpoint brings code of its own, which is not run; "
             "take auto_map out of a copy of the file if transformers' own LLaMA computes the same"

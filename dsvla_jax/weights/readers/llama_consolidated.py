@@ -46,7 +46,7 @@ META_NAMES = {
 ROTATED = re.compile(r"\bw[qk]\.(weight|bias)$|\blora_w[qk]_l2\.weight$")
 
 
-def read_language(folder: Path) -> Tower:
+def read_language(folder: Path) -> Tower[LanguageConfig]:
     """The LLaMA decoder of a folder with params.json and one consolidated.00.pth.
 
     Raises WeightsError naming file and key where anything is missing, left over, or of another shape or kind.

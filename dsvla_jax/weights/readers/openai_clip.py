@@ -40,7 +40,7 @@ CLIP_NAMES = {
 }
 
 
-def read_vision(file: Path, projection: bool = False) -> Tower:
+def read_vision(file: Path, projection: bool = False) -> Tower[VisionConfig]:
     """The vision transformer of a CLIP file: a state dict, or the TorchScript archive that OpenAI published.
 
     projection: read the projection into CLIP's joint embedding too.

@@ -32,7 +32,7 @@ def language_json(config: LanguageConfig, dtype: str) -> dict[str, Json]:
             "no LlamaForCausalLM has, so it cannot be exported as one"
         )
     scaling = config.rope_scaling
-    fields = {
+    fields: dict[str, Json] = {
         "architectures": ["LlamaForCausalLM"],
         "model_type": "llama",
         "hidden_act": "silu",
@@ -66,7 +66,7 @@ def language_json(config: LanguageConfig, dtype: str) -> dict[str, Json]:
 def vision_json(config: VisionConfig, dtype: str) -> dict[str, Json]:
     """The config.json of a CLIPVisionModel; with CLIP's projection, of a CLIPVisionModelWithProjection."""
     projected = config.embed_width is not None
-    fields = {
+    fields: dict[str, Json] = {
         "architectures": ["CLIPVisionModelWithProjection" if projected else "CLIPVisionModel"],
         "model_type": "clip_vision_model",
         "hidden_act": "quick_gelu",
@@ -83,7 +83,7 @@ def vision_json(config: VisionConfig, dtype: str) -> dict[str, Json]:
     return fields | ({"projection_dim": config.embed_width} if projected else {})
 
 
-def write_json(file: Path, content: Mapping[str, Json]) -> None:
+def write_json(file: Path, content: Mapping[str, object]) -> None:
     """Writes an object as JSON."""
     file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
