@@ -100,7 +100,8 @@ def test_row_is_what_the_table_says(name: str, row: tuple[bool, bool, bool]):
     batch = batch_of(experiment)
     near = suite_tokenizer().encode("near")[0]
     assert (batch.text.tokens == near).any(axis=1).all() == constraint
-    inputs = model_inputs(*jax.tree.map(jnp.asarray, (batch.picture, batch.text)), experiment.encoding)
+    example = jax.tree.map(jnp.asarray, batch)
+    inputs = model_inputs(example.picture, example.text, experiment.encoding)
     tokens = inputs.point_tokens.shape[1]
     assert tokens == (experiment.model.vision.num_patches if points else 0)
     in_order = (np.asarray(inputs.point_patches) == np.arange(tokens)).all()

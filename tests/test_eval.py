@@ -137,9 +137,7 @@ def test_results_written_elsewhere_are_compared(tmp_path: Path, capsys):
     printed = capsys.readouterr().out
     assert "lamp_on" in printed
     assert "close_box" in printed
-    with pytest.raises(
-        UserError, match="run/eval: no results under these conditions; evaluate first"
-    ):
+    with pytest.raises(UserError, match="run/eval: no results under these conditions; evaluate first"):
         program.main(program.Options(tmp_path / "run", compare=(tmp_path / "other",)))
 
 

@@ -141,7 +141,8 @@ def test_a_model_with_eight_bit_kernels_is_the_model_with_their_values():
     variables = initialize(model, jax.random.key(0))
     full = {**variables, "params": dequantize(variables["params"])}
     batch = random_batch(experiment)
-    inputs = model_inputs(*jax.tree.map(jnp.asarray, (batch.picture, batch.text)), experiment.encoding)
+    example = jax.tree.map(jnp.asarray, batch)
+    inputs = model_inputs(example.picture, example.text, experiment.encoding)
 
     @jax.jit
     def run(params, lora):

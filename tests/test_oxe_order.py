@@ -4,6 +4,7 @@ import json
 import math
 import os
 
+import jax
 import numpy as np
 import pytest
 
@@ -125,9 +126,7 @@ def test_a_stopped_run_goes_on_with_the_same_thousand_samples(folder, processes)
         resumed.set_state(state)
         for _ in range(batches):
             expected, got = next(loader), next(resumed)
-            assert expected.keys() == got.keys()
-            for name in expected:
-                np.testing.assert_array_equal(got[name], expected[name])
+            jax.tree.map(np.testing.assert_array_equal, got, expected)
 
 
 def test_threads_do_not_take_each_others_blocks_away(folder, monkeypatch):

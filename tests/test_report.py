@@ -3,6 +3,7 @@ import html.parser
 import io
 import json
 import re
+from typing import Literal
 
 import cv2
 import jax.numpy as jnp
@@ -51,7 +52,7 @@ def test_wilson_interval_at_its_ends_and_beyond():
         wilson_interval(8, 7)
 
 
-def result(task, episode, success, physics="mujoco", **changes):
+def result(task, episode, success, physics: Literal["mujoco", "mjx"] = "mujoco", **changes):
     fields = {
         "reason": "" if success else "out of keyframes",
         "keyframes": 2,

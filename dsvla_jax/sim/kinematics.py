@@ -51,13 +51,14 @@ class Chain(NamedTuple):
     position: Array
 
 
-def _combine(columns: Sequence[Array], weights: np.ndarray) -> Array | float:
+def _combine(columns: Sequence[Array], weights: np.ndarray) -> Array:
     """The sum of three vectors times constants (3,), or 0 if all of these are.
 
     Written out because most are 0 or 1, and because products of 3x3 matrices one by one cost a CPU more in calls than
     in arithmetic.
     """
-    return sum(column if w == 1 else column * np.float32(w) for column, w in zip(columns, weights, strict=True) if w)
+    terms = [column if w == 1 else column * np.float32(w) for column, w in zip(columns, weights, strict=True) if w]
+    return sum(terms, start=jnp.float32(0))
 
 
 def _chain(joints: Array, base: Array) -> Chain:
