@@ -32,7 +32,7 @@ MESHES = {"data": MeshConfig(-1, 1, 1), "fsdp": MeshConfig(1, -1, 1)}
 
 def variables_only(trainable: Any) -> Arrays:
     """What a step holds for those who read variables only: the rest is as small as it can be."""
-    one = np.zeros(1, np.int32)
+    one = jax.numpy.zeros(1, np.int32)
     return Arrays(trainable, optimizer={"count": one}, counters={"step": one}, rng={"key": one})
 
 

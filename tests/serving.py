@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
@@ -21,9 +21,9 @@ SIZE = 32
 PROMPTS = ("turn on the light", "close the fridge", "lift the ball", "press the red button")
 
 
-def tiny_policy(use_keypoints: bool = True, use_points: bool = True) -> Policy:
+def tiny_policy(use_keypoints: bool = True, use_points: bool = True, words: Iterable[str] = PROMPTS) -> Policy:
     """Random weights, larger than at initialisation, so that different observations get different answers."""
-    tokenizer = WordTokenizer(vocabulary(PROMPTS))
+    tokenizer = WordTokenizer(vocabulary(words))
     encoding = small_encoding(max_text_length=48, use_keypoints=use_keypoints, use_points=use_points)
     model = ModelConfig(
         vision=small_vision(),

@@ -17,7 +17,7 @@ from tests.serving import SIZE, tiny_policy
 @pytest.mark.slow
 def test_both_loops_give_the_same_episodes():
     environment = Environment("lamp_on", "mjx", image_size=SIZE)
-    policy = tiny_policy()
+    policy = tiny_policy(words=environment.task.all_instructions())
     state = environment.reset(episode_keys(0, "validation", "lamp_on", 0, 3))
     source = SegmentationKeypoints(environment, state)
     found, problems = source(state, environment.observe(state))

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from typing import Any
 
 import jax
 import numpy as np
@@ -143,6 +144,7 @@ def test_a_position_of_other_data_is_refused(folder):
     state = make(folder).get_state()
     with pytest.raises(DataError, match=r"saved position: data: expected .*; put the same data back"):
         make(folder, FIVE[:4]).set_state(state)
-    assert set(state["scale"]) == {"low", "high"}
+    scale: Any = state["scale"]
+    assert set(scale) == {"low", "high"}
     with pytest.raises(DataError, match=r"saved position: scale: expected .*; put the same data back"):
         make(folder, horizon=0.3).set_state(state)

@@ -3,6 +3,7 @@
 import pickle
 import random
 import subprocess
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,7 +68,8 @@ def test_arrays_come_back(tmp_path, protocol):
     ]
     path = tmp_path / "x.pkl"
     path.write_bytes(pickle.dumps(values, protocol))
-    for read, value in zip(read_pickle(path), values, strict=True):
+    stored: Any = read_pickle(path)
+    for read, value in zip(stored, values, strict=True):
         np.testing.assert_array_equal(to_array(read), value)
         assert to_array(read).shape == np.shape(value)
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -479,7 +480,7 @@ def test_bfloat16_on_disk_is_float32_in_the_model(tmp_path):
 def test_a_failed_write_leaves_no_folder(tmp_path):
     def write():
         leaves = {"a": jax.ShapeDtypeStruct((3,), np.float32)}
-        with create_weights(tmp_path / "out", leaves, {"not JSON": object()}) as arrays:
+        with create_weights(tmp_path / "out", leaves, cast(Any, {"not JSON": object()})) as arrays:
             arrays["a"][...] = np.ones(3, np.float32)
 
     with pytest.raises(TypeError):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
+from typing import cast
 
 import cv2
 import numpy as np
@@ -101,7 +102,7 @@ def _values(build: RldsBuild, episodes: Sequence[RldsEpisode]) -> Table:
     """Statistics of the numbers of every step, feature by feature."""
     rows = []
     for path, feature in _features(build):
-        size = int(np.prod([size or 0 for size in feature.shape]))
+        size = int(np.prod([size or 0 for size in cast(tuple[int | None, ...], feature.shape)]))
         if not path.startswith("steps/") or not is_number(feature) or not 0 < size <= WIDE:
             continue
         values = np.concatenate([episode.column(path).reshape(-1, size) for episode in episodes]).astype(np.float64)

@@ -10,7 +10,7 @@ from typing import SupportsIndex
 import grain
 import numpy as np
 
-from data_pipelines.oxe.dataset import OxeDataset
+from data_pipelines.oxe.dataset import OxeDataset, View
 from data_pipelines.oxe.index import Index, load_index, main_view
 from data_pipelines.oxe.order import BlockOrder, deal, recent, schedule
 from data_pipelines.oxe.registry import get_dataset, get_mixture
@@ -60,7 +60,7 @@ class OpenDataset:
 
     def __init__(self, build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progress: bool = True) -> None:
         self.build, self.dataset, self.config = build, dataset, config
-        self.view = main_view(dataset)
+        self.view: View = main_view(dataset)
         self.index: Index = load_index(self.build, dataset, config, progress)
         if config.unlabelled == "refuse" and self.index.unlabelled:
             got = f"{self.index.unlabelled} of {self.num_episodes} without"

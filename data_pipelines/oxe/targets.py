@@ -130,11 +130,12 @@ def _between(motion: Motion, start: np.ndarray, end: np.ndarray, frame: str) -> 
             positions.append(positions[-1] + (rotations[-1].apply(moved) if frame == "tool" else moved))
             rotations.append(rotations[-1] * turns[step] if frame == "tool" else turns[step] * rotations[-1])
         passed = np.stack(positions)
-        turned = Rotation.concatenate(rotations)
+        quaternions = Rotation.concatenate(rotations).as_quat()
+        first, last = Rotation.from_quat(quaternions[start]), Rotation.from_quat(quaternions[end])
         if frame == "tool":
-            result[:, arm, :3] = turned[start].inv().apply(passed[end] - passed[start])
-            result[:, arm, 3:] = (turned[start].inv() * turned[end]).as_rotvec()
+            result[:, arm, :3] = first.inv().apply(passed[end] - passed[start])
+            result[:, arm, 3:] = (first.inv() * last).as_rotvec()
         else:
             result[:, arm, :3] = passed[end] - passed[start]
-            result[:, arm, 3:] = (turned[end] * turned[start].inv()).as_rotvec()
+            result[:, arm, 3:] = (last * first.inv()).as_rotvec()
     return result

@@ -6,7 +6,7 @@ SRC is a folder of tasks as RLBench's generators write it. OUT receives episodes
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -211,7 +211,7 @@ def main(options: Options) -> None:
     report(options.out, skipped)
 
 
-def report(out: Path, skipped: list[dict[str, Json]]) -> None:
+def report(out: Path, skipped: Sequence[Mapping[str, Json]]) -> None:
     """Prints what the folder holds now and what was left out."""
     shards = existing_shards(out, {})
     counts: dict[str, int] = {}

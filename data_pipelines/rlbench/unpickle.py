@@ -127,7 +127,7 @@ def to_array(value: object) -> np.ndarray:
     match value.name, value.args, value.state:
         case "_reconstruct", _, (_, tuple(shape), Node() as dtype, fortran, data):
             return _array(data, dtype, shape, "F" if fortran else "C")
-        case "_frombuffer", (data, Node() as dtype, tuple(shape), order), _:
+        case "_frombuffer", (data, Node() as dtype, tuple(shape), str(order)), _:
             return _array(data, dtype, shape, order)
         case "scalar", (Node() as dtype, data), _:
             return _array(data, dtype, (), "C")

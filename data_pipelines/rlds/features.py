@@ -36,7 +36,7 @@ _FIX = "is features.json that of these records? Or leave bad records out with --
 def parse_features(json_value: Mapping[str, Json], where: object) -> dict[str, FeatureConnector]:
     """The leaves of a parsed ``features.json`` by their path, as ``steps/observation/image``."""
     try:
-        features = FeatureConnector.from_json(json_value)
+        features = FeatureConnector.from_json(dict(json_value))
     except (KeyError, ValueError, TypeError, AttributeError, ImportError, ParseError) as error:
         fix = "copy the build again, or install the tensorflow_datasets that wrote it"
         raise DataError(where, "features", "the features of a tfds build", str(error), fix) from error

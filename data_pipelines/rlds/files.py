@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import fsspec
 from fsspec import AbstractFileSystem
@@ -31,7 +31,7 @@ def open_binary(path: str) -> BinaryIO:
         if not is_remote(path):
             return Path(path).open("rb")
         file_system, name = _file_system(path)
-        return file_system.open(name, "rb")
+        return cast(BinaryIO, file_system.open(name, "rb"))
     except FileNotFoundError as error:
         raise DataError(path, "file", "to be present", "no such file", "copy the whole build again") from error
 
@@ -55,7 +55,7 @@ def size_of(path: str) -> int:
     if not is_remote(path):
         return Path(path).stat().st_size
     file_system, name = _file_system(path)
-    return int(file_system.size(name))
+    return int(cast(int, file_system.size(name)))
 
 
 def written(path: str) -> float | None:

@@ -32,10 +32,8 @@ class StoredVariable:
         how = traverse_util.unflatten_dict({self.path: ocp.RestoreArgs(restore_type=np.ndarray)})
         with ocp.PyTreeCheckpointer() as checkpointer:
             args = ocp.args.PyTreeRestore(item=item, restore_args=how, partial_restore=True)
-            restored: dict[tuple[str, ...], np.ndarray] = traverse_util.flatten_dict(
-                checkpointer.restore(self.folder, args=args)
-            )
-            return restored[self.path]
+            restored = traverse_util.flatten_dict(checkpointer.restore(self.folder, args=args))
+            return np.asarray(restored[self.path])
 
 
 def stored_variables(items: Iterable[tuple[Path, PyTree]]) -> dict[tuple[str, ...], StoredVariable]:

@@ -8,6 +8,7 @@ import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import cast
 
 import jax
 import numpy as np
@@ -102,7 +103,7 @@ def restore_weights(
     }
     require_same_shapes(traverse_util.unflatten_dict(stored, sep="."), like, folder)
     restored: dict[str, jax.Array] = {}
-    leaves: dict[str, jax.ShapeDtypeStruct] = traverse_util.flatten_dict(like, sep="/")
+    leaves = cast(dict[str, jax.ShapeDtypeStruct], traverse_util.flatten_dict(like, sep="/"))
     for path, leaf in leaves.items():
         restored |= convert(path, _restore_array(stored[path.replace("/", ".")], leaf))
     return traverse_util.unflatten_dict(restored, sep="/")

@@ -8,6 +8,7 @@ https://github.com/huggingface/safetensors (README, "Format").
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 from dsvla_jax.json_values import Json
 from dsvla_jax.weights.stored_tensors import AGAIN, StoredTensor, WeightsError
@@ -53,8 +54,9 @@ def _list_shards(folder: Path) -> dict[str, StoredTensor]:
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, Mapping) or not all(isinstance(name, str) for name in weight_map.values()):
         raise WeightsError(f"{index}: expected a weight_map of names to files; {AGAIN}")
+    files = cast(Mapping[str, str], weight_map)
     tensors: dict[str, StoredTensor] = {}
-    for name in sorted(set(weight_map.values())):
+    for name in sorted(set(files.values())):
         shard = folder / name
         if shard.name != name or not shard.is_file():
             raise WeightsError(f"{shard}: this shard is missing, {index.name} names it; {AGAIN}")
@@ -62,7 +64,7 @@ def _list_shards(folder: Path) -> dict[str, StoredTensor]:
         if twice := sorted(tensors.keys() & more.keys()):
             raise WeightsError(f"{shard}: {twice[0]} is in {tensors[twice[0]].file.name} already; {AGAIN}")
         tensors |= more
-    for key, name in weight_map.items():
+    for key, name in files.items():
         if key not in tensors or tensors[key].file.name != name:
             raise WeightsError(f"{folder / name}: {key} is not in it, though {index.name} says so; {AGAIN}")
     return tensors
