@@ -8,7 +8,7 @@ import cattrs
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
-from jax.tree_util import DictKey
+from jax.tree_util import KeyPath, keystr
 from numpy.typing import DTypeLike
 
 from dsvla_jax.checkpoints.storage import CheckpointError, PyTree, require_same_shapes
@@ -180,8 +180,8 @@ def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -
         like["lora"] = {"language": variables["lora"]["language"]}
     where = shardings(like, mesh)
 
-    def placed(path: tuple[DictKey, ...], leaf: jax.ShapeDtypeStruct, sharding: NamedSharding) -> jax.ShapeDtypeStruct:
-        keys = [key.key for key in path]
+    def placed(path: KeyPath, leaf: jax.ShapeDtypeStruct, sharding: NamedSharding) -> jax.ShapeDtypeStruct:
+        keys = keystr(path, simple=True, separator="/").split("/")
         narrow = keys[1] in TOWERS and keys[0] == "params" and keys[-1] in MATRICES
         dtype = model.frozen_dtype if narrow and frozen else leaf.dtype
         return jax.ShapeDtypeStruct(leaf.shape, dtype, sharding=sharding)
