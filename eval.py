@@ -68,7 +68,7 @@ class Options:
     keypoints: Keypoints | None = None
     """What the policy is told to go near, as in its training if not given: the task's own points as they are at the
     start (oracle); those found in the first picture, by the simulator's masks and the depth on them (segmentation;
-    paper, section 3.3); or those found in the picture before every key pose, hidden objects where they were last seen
+    paper, section 3.3); or those found in the picture before every keyframe, hidden objects where they were last seen
     (segmentation-refresh)."""
     keypoint_noise: float = 0.0
     """Metres of uniform noise an axis on every keypoint (paper, section 4.3: up to 0.1)."""

@@ -2,7 +2,7 @@
 
 Usage: python -m benchmarks.device_loop [RUN] [--tasks lamp_on put_rubbish_in_bin] [--batches 4 16]
 
-Both step MJX. An episode agrees if its outcome, its number of key poses and every answer are the same. The same start
+Both step MJX. An episode agrees if its outcome, its number of keyframes and every answer are the same. The same start
 is run four times: rates are of the quickest of the last three; the first one's seconds, most of them XLA's, are printed
 beside them.
 """

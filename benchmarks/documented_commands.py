@@ -103,7 +103,7 @@ RULES = (
     Rule("plan.py .*--examples", "--examples 8 16"),
     Rule("plan.py"),
     Rule("dsvla_jax.serving", words=OWN, serves=True),
-    Rule("robot_client", "--key-poses 2", fails="no success"),
+    Rule("robot_client", "--keyframes 2", fails="no success"),
     Rule("dsvla_jax.evaluation.demo"),
     Rule("expert_success", "--episodes 4"),
     Rule("raycast_parity"),

@@ -2,7 +2,7 @@
 
 Usage: python -m benchmarks.expert_success [--tasks lamp_on ...] [--episodes 100] [--film FOLDER]
 
---film writes a picture a task: the first four episodes, a row each, at reset and after every key pose.
+--film writes a picture a task: the first four episodes, a row each, at reset and after every keyframe.
 """
 
 import dataclasses

@@ -49,7 +49,7 @@ def fastest(*functions: Callable[[], Any], repeats: int = REPEATS) -> list[float
 
 
 def first_action(environment: Environment, state: Any) -> Action:
-    """The first key pose of the expert."""
+    """The first keyframe of the expert."""
     return jax.tree.map(lambda x: x[:, 0], environment.expert(state))
 
 

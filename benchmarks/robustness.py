@@ -29,12 +29,12 @@ class Options:
 
     tasks: tuple[str, ...] = ("all",)
     keyframes: int = 67
-    """Random key poses, of 150 physics steps each."""
+    """Random keyframes, of 150 physics steps each."""
     physics: Literal["mujoco", "mjx"] = "mujoco"
 
 
 def random_action(rng: np.random.Generator, arms: int) -> Action:
-    """Key poses all over the table, into it and out of reach, every third of them with the gripper straight down."""
+    """Keyframes all over the table, into it and out of reach, every third of them with the gripper straight down."""
     low, high = [-0.4, -0.5, TABLE_HEIGHT - 0.05], [0.6, 0.5, TABLE_HEIGHT + 0.6]
     turns = rng.normal(size=(BATCH, arms, 4))
     down = np.broadcast_to([0.0, 1.0, 0.0, 0.0], turns.shape)

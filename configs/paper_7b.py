@@ -14,7 +14,7 @@ from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 
 EPOCHS, DEMONSTRATIONS, BATCH = 10, 100, 3
-# One demonstration of each of the 26 tasks has so many key poses together (docs/tasks.md).
+# One demonstration of each of the 26 tasks has so many keyframes together (docs/tasks.md).
 KEY_POSES = 124
 
 

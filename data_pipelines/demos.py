@@ -1,7 +1,7 @@
 """Scripted-expert demonstrations: python -m data_pipelines.demos OUT --tasks lamp_on put_rubbish_in_bin --episodes 100
 
 Runs the tasks' scripted experts in C MuJoCo, several tasks at a time, and replaces the episodes that fail by further
-seeds. An episode is kept if it succeeded and if its recorded key poses, replayed from its seed, succeed too.
+seeds. An episode is kept if it succeeded and if its recorded keyframes, replayed from its seed, succeed too.
 Interrupted, it continues with the first missing shard; every shard depends only on the options and its own number, so
 the result is the same.
 """
@@ -53,10 +53,10 @@ class Settings:
     split: Literal["train", "validation", "eval"] = "train"
     """The stream of seeds; evaluations start from those of `eval`."""
     perturb: float = 0.03
-    """Most metres an axis by which the arms miss a key pose, so that observations off the expert's path are recorded,
-    with the expert's next key pose as the target."""
+    """Most metres an axis by which the arms miss a keyframe, so that observations off the expert's path are recorded,
+    with the expert's next keyframe as the target."""
     perturb_probability: float = 0.5
-    """How often a key pose is missed on purpose."""
+    """How often a keyframe is missed on purpose."""
     keypoints: Literal["segmentation", "oracle"] = "segmentation"
     """Those found in the first picture by the simulator's masks and the depth on them, or the task's own points. An
     attempt in which an object is not seen is replaced like one that failed."""
@@ -124,7 +124,7 @@ class ScriptedExpert:
             state = environment.step(
                 state, Action(pose=jnp.asarray(missed[:, m]), gripper_open=jnp.asarray(grippers[:, m]))
             )
-        # Success after so many key poses of the plan, none of them missed: bool (B, M + 1).
+        # Success after so many keyframes of the plan, none of them missed: bool (B, M + 1).
         unmissed = environment.follow(start_state, plan)
         replayed = np.stack([np.asarray(environment.success(after)) for after in unmissed], axis=1)
         keypoints, unseen = self._keypoints(start_state, observations[0])
@@ -170,7 +170,7 @@ class ScriptedExpert:
         return points, np.array([bool(problem) for problem in problems])
 
     def _misses(self, rng: np.random.Generator, frames: int) -> np.ndarray:
-        """How far each key pose is missed, float (M, 1, 3) metres.
+        """How far each keyframe is missed, float (M, 1, 3) metres.
 
         The last one is never missed: nothing is observed after it. Two arms miss together, because apart they would
         drop what they hold between them.

@@ -1,4 +1,4 @@
-"""Which frames of a demonstration are its key poses: PerAct's heuristic, exactly.
+"""Which frames of a demonstration are its keyframes: PerAct's heuristic, exactly.
 
 Sources: ``helpers/demo_loading_utils.py`` and ``agents/peract_bc/launch_utils.py`` of peract/peract, and the former of
 markusgrotz/peract_bimanual for two arms.
@@ -39,11 +39,11 @@ def discover_keyframes(
 
     A frame counts as a stop when all joints of all arms are still, it is not one of the last two frames, no gripper
     changes from two frames before it to one frame after, and the last stop was more than `stop_buffer` frames ago.
-    Frame 0 is never a key pose; of two adjacent ones at the end the first is dropped.
+    Frame 0 is never a keyframe; of two adjacent ones at the end the first is dropped.
 
     Looking back from frames 0 and 1 wraps to the end of the demonstration, as Python's negative indices do in PerAct.
     So a robot that stands still at the start uses up a stop on frame 0, unless its grippers end in another state than
-    they start in; then frame 1 or 2 may become a key pose.
+    they start in; then frame 1 or 2 may become a keyframe.
 
     Args:
         gripper_open: float (T, A), compared for equality. joint_velocities: float (T, A, J), radians per second.
@@ -72,10 +72,10 @@ def discover_keyframes(
 
 
 def sample_starts(keyframes: list[int], every_n: int) -> list[tuple[int, int]]:
-    """(frame to look at, key pose to go to) for every sample of a demonstration, in order, each frame once.
+    """(frame to look at, keyframe to go to) for every sample of a demonstration, in order, each frame once.
 
-    Frames: the first, every key pose but the last, and, with every_n > 0, every `every_n`-th before the last. Each
-    goes to the next key pose. PerAct adds the key poses again for each of the latter; here an epoch has them once.
+    Frames: the first, every keyframe but the last, and, with every_n > 0, every `every_n`-th before the last. Each
+    goes to the next keyframe. PerAct adds the keyframes again for each of the latter; here an epoch has them once.
     """
     if not keyframes:
         return []

@@ -78,7 +78,7 @@ def make_demonstration(
     """
     check_recording(recording, where)
     if not samples:
-        raise DataError(where, "samples", "at least one key pose to go to", "none", "record until the task is done")
+        raise DataError(where, "samples", "at least one keyframe to go to", "none", "record until the task is done")
     starts, targets = (np.array(column) for column in zip(*samples, strict=True))
     count = len(recording.pose)
     intrinsics, cameras = (

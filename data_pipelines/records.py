@@ -36,7 +36,7 @@ class Episode:
     rgb_png, depth_png: F encoded pictures each (see ``encode_rgb`` and ``encode_depth``).
     intrinsics: float32 (F, 3, 3). world_from_camera: float32 (F, 4, 4).
     pose: float32 (F, A, 7). gripper_open: float32 (F, A). The state in which the frame was recorded.
-    target_pose: float32 (F, A, 7). target_gripper: float32 (F, A). The next key pose.
+    target_pose: float32 (F, A, 7). target_gripper: float32 (F, A). The next keyframe.
     keypoints: float32 (A, K, 3), in the order of the instruction. active_keypoint: float32 (F, A, 3). Where no keypoint
         is known, K is 0 and active_keypoint (F, 0, 3): such a demonstration is prompted without the constraint.
     seed: the number of the episode in its seed stream. variation: which of the task's variations it is, None where

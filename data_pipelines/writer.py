@@ -40,9 +40,9 @@ class DemonstrationWriter:
     `EPISODES_PER_SHARD` recordings of a task, and at the end of the block, also if that ends in an error. Recordings
     that the disk has no room for stay in memory: free space, then call `close`.
 
-    every_n: further samples start at every so many observations between key poses; 0 for none.
+    every_n: further samples start at every so many observations between keyframes; 0 for none.
     codec: the policy's; a pose outside of its box could not be written as text, and is refused.
-    still, stop_buffer: radians per second below which all joints rest at a key pose, and observations after such a stop
+    still, stop_buffer: radians per second below which all joints rest at a keyframe, and observations after such a stop
     in which no further one counts. These and every_n are kept with each shard in the index.
     """
 
@@ -99,8 +99,8 @@ class DemonstrationWriter:
         """Checks a recording and adds it; returns what was made of it.
 
         Args:
-            keyframes: ascending numbers of the observations at key poses, the end included.
-            joint_velocities: (T, A, J), radians per second: finds key poses where grippers change and all joints rest.
+            keyframes: ascending numbers of the observations at keyframes, the end included.
+            joint_velocities: (T, A, J), radians per second: finds keyframes where grippers change and all joints rest.
 
         Raises:
             DataError: the recording cannot be right, or neither or both of the above are given.
@@ -117,7 +117,7 @@ class DemonstrationWriter:
         count = len(recording.pose)
         numbers = list(map(int, keyframes))
         if not numbers or numbers != sorted(set(numbers)) or numbers[0] < 1 or numbers[-1] >= count:
-            fix = "count observations from 0; the first is where the demonstration starts, not a key pose"
+            fix = "count observations from 0; the first is where the demonstration starts, not a keyframe"
             raise DataError(where, "keyframes", f"ascending numbers from 1 to {count - 1}", str(numbers)[:80], fix)
         episode = make_demonstration(recording, sample_starts(numbers, self.every_n), number, where)
         self._check_box(episode, where)
@@ -134,7 +134,7 @@ class DemonstrationWriter:
     def _discover(self, recording: Recording, joint_velocities: np.ndarray | None, where: str) -> list[int]:
         gripper = np.asarray(recording.gripper_open)
         if joint_velocities is None:
-            fix = "give joint velocities, from which key poses are found, or the key poses themselves"
+            fix = "give joint velocities, from which keyframes are found, or the keyframes themselves"
             raise DataError(where, "keyframes", "them or joint_velocities", "neither", fix)
         shape = np.shape(joint_velocities)
         if len(shape) != 3 or shape[:2] != gripper.shape:
@@ -187,7 +187,7 @@ class DemonstrationWriter:
         if self._restless and not self._lock.closed:
             print(
                 f"{self.folder}: in {self._restless} of {self._discovered} recordings the joints never all rest (below "
-                f"{self.still:g} rad/s): key poses are changes of a gripper and the end",
+                f"{self.still:g} rad/s): keyframes are changes of a gripper and the end",
                 file=sys.stderr,
             )
         self._lock.close()

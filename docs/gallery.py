@@ -29,13 +29,13 @@ INTRODUCTION = """# The tasks
 {count} tasks, named as in RLBench, built from primitive shapes. Each picture shows an episode at its start and when the
 scripted expert has succeeded, as the front camera sees it. Objects are placed at random; a task with variations also
 changes its colours, counts or places, and the instruction with them (the first variation is shown). Every task has
-three to five ways to say it. "Key poses" is how many the expert takes. [Adding a task](tasks_adding.md) takes one file.
+three to five ways to say it. "Keyframes" is how many the expert takes. [Adding a task](tasks_adding.md) takes one file.
 
 This page and its pictures are made by `python -m docs.gallery`.
 """
 TPU = """## On accelerators
 
-Observing (128 px) and executing one key pose of {episodes} episodes in MJX, compiled ahead of time for a TPU v5e 2x2
+Observing (128 px) and executing one keyframe of {episodes} episodes in MJX, compiled ahead of time for a TPU v5e 2x2
 slice from a CPU by `python -m benchmarks.tpu_compile`: seconds to trace and lower and to compile there, and the memory
 that arguments, results and temporaries take on each of the four chips (16 GiB). No TPU has run them.
 
@@ -52,7 +52,7 @@ class Options:
 
 
 def draw(name: str) -> Path:
-    """An episode of the first variation at reset and after the expert's last key pose, side by side."""
+    """An episode of the first variation at reset and after the expert's last keyframe, side by side."""
     environment = Environment(name, image_size=SIZE)
     keys = episode_keys(1, "validation", name, 0, CANDIDATES)
     start = environment.reset(keys, variation=jnp.zeros(CANDIDATES, jnp.int32))
@@ -99,7 +99,7 @@ def write_page() -> Path:
     parts = [INTRODUCTION.format(count=len(TASKS))]
     for arms, title in GROUPS.items():
         tasks = [task for _, task in sorted(TASKS.items()) if task.num_arms == arms]
-        table = ["| start, success | task | instruction | variations | key poses |", "|---|---|---|---:|---:|"]
+        table = ["| start, success | task | instruction | variations | keyframes |", "|---|---|---|---:|---:|"]
         parts.append("\n".join([f"## {title} ({len(tasks)})", "", *table, *map(row, tasks), ""]))
     compiled = DOCS / "tpu_compile.json"
     if compiled.exists():

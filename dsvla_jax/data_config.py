@@ -27,7 +27,7 @@ class DataConfig:
     seed: int = 0
     """Seed of the demonstrations that are generated."""
     perturb: float = 0.03
-    """Metres by which half of the key poses are missed on purpose, so that the next sample starts off the path."""
+    """Metres by which half of the keyframes are missed on purpose, so that the next sample starts off the path."""
     keypoints: Literal["segmentation", "oracle"] = "segmentation"
     """Of simulated demonstrations, and so of evaluation unless it is told otherwise: those found in the first picture
     by the simulator's masks and the depth on them (paper, section 3.3), or the task's own points."""
@@ -76,7 +76,7 @@ class OxeConfig:
     target: Literal["relative", "absolute"] = "relative"
     """relative: displacement from the present pose, binned between its 1 % and 99 % quantiles; absolute: the pose."""
     horizon: float = 1.0
-    """Seconds from a frame to its target; 0 for the next key frame."""
+    """Seconds from a frame to its target; 0 for the next keyframe."""
     image_size: int = 224
     """Pixels a side of the square picture."""
     crop: float = 0.9

@@ -69,7 +69,7 @@ PROMPT_TOKENS = 64
 class Decision:
     """What a policy decided for a batch.
 
-    action: the next key poses. texts: the answers that name them. log_probs, entropies: float32 (B, A, 8), of each
+    action: the next keyframes. texts: the answers that name them. log_probs, entropies: float32 (B, A, 8), of each
     number among those that its slot admits, and in nats of its slot's distribution: how sure the policy was.
     """
 
@@ -129,7 +129,7 @@ class Policy:
     def act(
         self, observation: Observation, instructions: Sequence[str], keypoints: np.ndarray | None
     ) -> tuple[Action, list[str]]:
-        """The next key pose of every robot of a batch, and the answer texts that name it; see `decide`."""
+        """The next keyframe of every robot of a batch, and the answer texts that name it; see `decide`."""
         decision = self.decide(observation, instructions, keypoints)
         return decision.action, decision.texts
 
@@ -141,7 +141,7 @@ class Policy:
         key: Array | None = None,
         prompt_tokens: int | None = None,
     ) -> Decision:
-        """The next key pose of every robot of a batch. It is well-formed whatever the weights are.
+        """The next keyframe of every robot of a batch. It is well-formed whatever the weights are.
 
         observation: with a leading axis B of any size. keypoints: float32 (B, A, 3), the active one of
         each arm, in metres and the world frame, or None. key: for ``decoding`` that samples. prompt_tokens: the length

@@ -1,7 +1,7 @@
 """A robot's loop around a policy server: python examples/robot_client.py [--task lamp_on] [--dry-run]
 
 Start a server first: python -m dsvla_jax.serving RUN. For your own robot write a class with `observe` and `move`. With
---dry-run nothing moves: each key pose is checked and printed.
+--dry-run nothing moves: each keyframe is checked and printed.
 """
 
 import dataclasses
@@ -112,9 +112,9 @@ class DryRun:
         return False
 
 
-def run_episode(policy: Any, robot: Robot, prompt: str, key_poses: int) -> bool:
+def run_episode(policy: Any, robot: Robot, prompt: str, keyframes: int) -> bool:
     """Asks and moves until the robot is done. policy: a `PolicyClient`, or openpi-client's `WebsocketClientPolicy`."""
-    for step in range(key_poses):
+    for step in range(keyframes):
         reply = policy.infer({**robot.observe(), "prompt": prompt, "reset": step == 0})
         actions = reply["actions"][0].reshape(-1, 8)
         print(f"{step + 1}: {reply['text']}  ({reply['server_timing']['infer_ms']:.0f} ms)")
@@ -160,7 +160,7 @@ class Options:
     """The simulated robot's task."""
     seed: int = 0
     """The number of the episode."""
-    key_poses: int = 10
+    keyframes: int = 10
     """After which an episode is over."""
     timeout: float = 60.0
     """Seconds to connect, and for each reply."""
@@ -171,10 +171,10 @@ class Options:
 
 
 def main(options: Options) -> int:
-    if options.key_poses < 1 or options.seed < 0 or not options.longest_move > 0:
+    if options.keyframes < 1 or options.seed < 0 or not options.longest_move > 0:
         raise UserError(
-            "--key-poses: expected at least 1, --seed at least 0, --longest-move more than 0; got "
-            f"{options.key_poses}, {options.seed}, {options.longest_move}"
+            "--keyframes: expected at least 1, --seed at least 0, --longest-move more than 0; got "
+            f"{options.keyframes}, {options.seed}, {options.longest_move}"
         )
     with PolicyClient(options.host, options.port, options.token, options.timeout) as policy:
         robot = simulated = simulated_robot(policy.metadata, options.task, options.seed)
@@ -182,7 +182,7 @@ def main(options: Options) -> int:
             low, high = policy.metadata["workspace_low"], policy.metadata["workspace_high"]
             robot = DryRun(simulated, low, high, options.longest_move)
         print(simulated.prompt)
-        success = run_episode(policy, robot, simulated.prompt, options.key_poses)
+        success = run_episode(policy, robot, simulated.prompt, options.keyframes)
     print("dry run: nothing was moved" if options.dry_run else "success" if success else "no success")
     return int(not success and not options.dry_run)
 

@@ -125,7 +125,7 @@ def test_without_an_accelerator_the_full_size_is_refused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_largest_programs_can_be_written_for_an_nvidia_gpu():
-    """The paper's training step, whose weights exist as shapes only, and a key pose in MJX."""
+    """The paper's training step, whose weights exist as shapes only, and a keyframe in MJX."""
     full = paper_experiment("full")
     full = dataclasses.replace(full, batch_size=1, model=dataclasses.replace(full.model, attention="fused"))
     tokenizer, optimizer = small_tokenizer("sentencepiece"), make_optimizer(full.optimizer, full.steps)

@@ -12,7 +12,7 @@ from data_pipelines.oxe.fixtures.write import write_fixture
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import get_dataset
-from data_pipelines.oxe.targets import key_frames, make_targets
+from data_pipelines.oxe.targets import keyframes, make_targets
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
@@ -101,7 +101,7 @@ def test_red_and_blue_are_put_right_where_the_copies_are_as_published(tmp_path, 
         assert np.abs(rgb.astype(int) - expected).max() <= 3
 
 
-def test_key_frames_are_gripper_changes_rests_and_the_end():
+def test_keyframes_are_gripper_changes_rests_and_the_end():
     positions = np.cumsum([0, 1, 1, 0, 0, 0, 1, 1, 1, 1, 1, 1], dtype=float) * 0.05
     pose = np.zeros((12, 1, 7), np.float32)
     pose[:, 0, 0], pose[:, 0, 6] = positions, 1
@@ -109,7 +109,7 @@ def test_key_frames_are_gripper_changes_rests_and_the_end():
     command[8:] = 0
     motion = Motion("", pose, command, None, command)
     # The hand rests from step 2 on, the gripper closes at step 8, the last step is 11.
-    assert key_frames(motion) == [2, 8, 11]
+    assert keyframes(motion) == [2, 8, 11]
     targets = make_targets(motion, get_dataset("cmu_stretch"), OxeConfig(target="absolute", horizon=0.0))
     assert targets.target_pose is not None
     np.testing.assert_allclose(targets.target_pose[:, 0, 0], positions[[2, 2, 8, 8, 8, 8, 8, 8, 11, 11, 11]])

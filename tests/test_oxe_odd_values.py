@@ -13,7 +13,7 @@ from data_pipelines.oxe.mixture import open_mixture
 from data_pipelines.oxe.motion import Motion
 from data_pipelines.oxe.registry import get_dataset
 from data_pipelines.oxe.scale import MixtureScale
-from data_pipelines.oxe.targets import key_frames
+from data_pipelines.oxe.targets import keyframes
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.writing import write_build
 from dsvla_jax.data_config import OxeConfig
@@ -142,7 +142,7 @@ def test_a_hand_that_only_trembles_comes_to_no_rest():
     pose = np.zeros((30, 1, 7), np.float32)
     pose[:, 0, :3], pose[:, 0, 6] = 1e-8 * rng.normal(size=(30, 3)), 1
     command = np.ones((30, 1), np.float32)
-    assert key_frames(Motion("", pose, command, None, command)) == [29]
+    assert keyframes(Motion("", pose, command, None, command)) == [29]
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_channels_and_quaternions_are_put_right(tmp_path):
     np.testing.assert_allclose(frame.robot.pose[:, 3:], [[0, 1, 0, 0]], atol=1e-6)
 
 
-def test_key_poses_are_found_or_named(tmp_path):
+def test_keyframes_are_found_or_named(tmp_path):
     moving = np.ones((STEPS, 1, 7))
     with DemonstrationWriter(tmp_path, every_n=0) as writer:
         found = writer.add(GOOD, joint_velocities=moving)

@@ -80,15 +80,15 @@ def keep_pictures(folder, numbers):
                 path.unlink()
 
 
-def test_a_copy_with_the_pictures_of_key_poses_only(tmp_path):
-    """Key poses are 16, 22, 32 and 39; the last one is gone to, and not looked at."""
+def test_a_copy_with_the_pictures_of_keyframes_only(tmp_path):
+    """Keyframes are 16, 22, 32 and 39; the last one is gone to, and not looked at."""
     source = write_source(tmp_path / "source")
     whole = imported(source, tmp_path / "whole", every_n=0)
     keep_pictures(episode_folder(source), {0, 16, 22, 32})
     with pytest.raises(
         DataError,
         match=r"front_rgb: folder: expected pictures of all 40 observations, got 4 \(no 1.png\); if they are those of "
-        r"key poses, import with --every-n 0",
+        r"keyframes, import with --every-n 0",
     ):
         import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
     assert_equal_episodes(imported(source, tmp_path / "out", every_n=0).episode(0), whole.episode(0))
@@ -153,7 +153,7 @@ def test_the_variation_is_kept_and_what_is_left_aside_is_said(tmp_path, capsys):
     assert [EpisodeReader(tmp_path / "out").episode(number).variation for number in range(2)] == [3, 5]
     assert capsys.readouterr().out.splitlines() == [
         f"{tmp_path / 'out'}: 2 episodes (lamp_on 2) of 2 variations, 12 samples",
-        "in 2 of them the joints never rest: key poses are changes of a gripper and the end (--still)",
+        "in 2 of them the joints never rest: keyframes are changes of a gripper and the end (--still)",
         "left aside, folder (episodes): front_mask (1); masks do not say of which object they are",
     ]
     by_variation = tmp_path / "upstream" / "lamp_on" / "variation7" / "episodes" / "episode0"

@@ -28,13 +28,13 @@ def keys_of(task: str) -> jax.Array:
 
 
 def follow(plan: Action):
-    """A policy that answers with the key poses of a plan (B, M, A, ...), then with the last of them."""
+    """A policy that answers with the keyframes of a plan (B, M, A, ...), then with the last of them."""
     poses, grippers = np.asarray(plan.pose), np.asarray(plan.gripper_open)
     steps = iter(range(10**6))
 
     def act(observation, instructions, keypoints):
         m = min(next(steps), poses.shape[1] - 1)
-        return Action(jnp.asarray(poses[:, m]), jnp.asarray(grippers[:, m])), [f"key pose {m}"] * len(instructions)
+        return Action(jnp.asarray(poses[:, m]), jnp.asarray(grippers[:, m])), [f"keyframe {m}"] * len(instructions)
 
     return act
 
@@ -100,7 +100,7 @@ def test_no_episodes_are_no_evaluation():
             run_task(lamp, run, episodes, split="validation", batch=batch)
 
 
-def test_episodes_are_given_up_after_a_key_pose():
+def test_episodes_are_given_up_after_a_keyframe():
     plan, asked = plan_of("lamp_on"), []
 
     def stop() -> bool:

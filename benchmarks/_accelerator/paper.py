@@ -208,7 +208,7 @@ def train(job: Job) -> None:
 
 
 def decode(job: Job) -> None:
-    """From observations to key poses on the host, for several numbers of robots that ask together."""
+    """From observations to keyframes on the host, for several numbers of robots that ask together."""
     experiment, tokenizer = paper_experiment(job.sizes.name), small_tokenizer("sentencepiece")
     shared = make_weights(job)
     state, frozen = shared.pop("state"), shared.pop("frozen")

@@ -25,7 +25,7 @@ from dsvla_jax.files import write_bytes
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 
-# Metres an axis by which key poses are missed at most, so that not all episodes succeed.
+# Metres an axis by which keyframes are missed at most, so that not all episodes succeed.
 MISS = 0.04
 
 

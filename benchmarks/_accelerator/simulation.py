@@ -35,12 +35,12 @@ EPISODE_TASK = "lamp_on"
 
 
 def lamp_on(job: Job) -> None:
-    """The device loop of a task whose expert has few key poses."""
+    """The device loop of a task whose expert has few keyframes."""
     device_loop(job, "lamp_on")
 
 
 def stack_blocks(job: Job) -> None:
-    """The device loop of a task with many bodies and key poses."""
+    """The device loop of a task with many bodies and keyframes."""
     device_loop(job, "stack_blocks")
 
 
@@ -66,7 +66,7 @@ def repeated(tree: Any, count: int) -> Any:
 
 
 def device_loop(job: Job, task: str) -> None:
-    """Key poses and episodes a second of the closed loop on the device, by how many run side by side."""
+    """Keyframes and episodes a second of the closed loop on the device, by how many run side by side."""
     policy, experiment, trained = policy_to_run(job)
     job.note(policy="trained" if trained else "random")
     environment = Environment(task, "mjx", image_size=experiment.data.image_size)

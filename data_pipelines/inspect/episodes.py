@@ -112,17 +112,17 @@ def _counts(by_task: dict[str, list[Episode]]) -> Table:
             str(group[0].num_arms),
             str(len(group)),
             str(sum(episode.num_frames for episode in group)),
-            f"{np.mean([_key_poses(episode) for episode in group]):.1f}",
+            f"{np.mean([_keyframes(episode) for episode in group]):.1f}",
             str(len({episode.instruction for episode in group})),
             str(max(episode.keypoints.shape[1] for episode in group)),
         )
         for task, group in by_task.items()
     ]
-    columns = ("task", "arms", "episodes", "samples", "key poses", "phrases", "keypoints")
+    columns = ("task", "arms", "episodes", "samples", "keyframes", "phrases", "keypoints")
     return Table("counts", columns, rows)
 
 
-def _key_poses(episode: Episode) -> int:
+def _keyframes(episode: Episode) -> int:
     targets = np.concatenate([episode.target_pose.reshape(episode.num_frames, -1), episode.target_gripper], axis=1)
     return 1 + int(np.any(targets[1:] != targets[:-1], axis=1).sum())
 
@@ -188,7 +188,7 @@ def _warnings(episodes: list[Episode], looks: list[_Look], encoding: EncodingCon
         ]
     )
     if idle.mean() > 0.1:
-        found.append(f"{100 * idle.mean():.0f} % of the samples ask for no motion: are the key poses right?")
+        found.append(f"{100 * idle.mean():.0f} % of the samples ask for no motion: are the keyframes right?")
     if (missing := np.mean([look.missing for look in looks])) > 0.5:
         found.append(f"{100 * missing:.0f} % of the pixels have no depth")
     distances = np.concatenate([look.keypoint_distance for look in looks])

@@ -146,7 +146,7 @@ def _targets(opened: OpenDataset, scale: MixtureScale) -> Table:
         (name, *(f"{value:.4f}" for value in values))
         for name, *values in zip(COMPONENTS, low, high, scale.scale.low, scale.scale.high, strict=True)
     ]
-    ahead = f"{opened.config.horizon:g} s ahead" if opened.config.horizon else "at the next key frame"
+    ahead = f"{opened.config.horizon:g} s ahead" if opened.config.horizon else "at the next keyframe"
     columns = ("displacement", "1 %", "99 %", "binned from", "binned to")
     return Table(f"targets: displacements to the pose {ahead}, of all samples", columns, rows)
 

@@ -48,7 +48,7 @@ def why_unsupported(dataset: OxeDataset, config: OxeConfig) -> str | None:
 def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targets:
     """The targets of an episode of T steps: one for every step but the last.
 
-    With a horizon, the target of step t is step t + horizon, or the last one; with key frames, the next key frame. Its
+    With a horizon, the target of step t is step t + horizon, or the last one; with keyframes, the next keyframe. Its
     displacement is that between reached poses if the dataset records poses, else the composition of the commands in
     between. The target's gripper is the command that holds there (of the last but one step at the end, where the last
     step's command was never carried out).
@@ -61,7 +61,7 @@ def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targ
         ahead = max(1, round(config.horizon * dataset.hz / dataset.stride))
         end = np.minimum(frame + ahead, steps - 1)
     else:
-        keys = np.array(key_frames(motion), int)
+        keys = np.array(keyframes(motion), int)
         end = keys[np.searchsorted(keys, frame, side="right")]
     unknown = np.broadcast_to(UNKNOWN_POSE, (steps, motion.num_arms, 7))
     present = unknown if motion.pose is None else motion.pose
@@ -83,10 +83,10 @@ def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targ
     )
 
 
-def key_frames(motion: Motion) -> list[int]:
+def keyframes(motion: Motion) -> list[int]:
     """Steps (ascending, the last one always among them) at which a gripper's command changes or all hands come to rest.
 
-    After a rest the next four steps are no other, as in PerAct's key frames.
+    After a rest the next four steps are no other, as in PerAct's keyframes.
     """
     steps = motion.num_steps
     moves = _speeds(motion)

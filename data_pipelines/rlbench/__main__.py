@@ -42,12 +42,12 @@ class Settings:
     camera: str = "front"
     """The camera to learn from."""
     every_n: int = 10
-    """Every how many observations a further sample starts, on the way to the next key pose; 0: key poses only."""
+    """Every how many observations a further sample starts, on the way to the next keyframe; 0: keyframes only."""
     keypoints: Literal["contacts", "none"] = "contacts"
     """RLBench records no keypoints. `contacts`: where each gripper opened or closed, and its last pose, looked up in
     the demonstration itself; none: prompts without the keypoint constraint."""
     still: float = STILL
-    """Radians per second: where all joints are slower than that, the robot has stopped at a key pose."""
+    """Radians per second: where all joints are slower than that, the robot has stopped at a keyframe."""
     stop_buffer: int = STOP_BUFFER
     """Observations after a stop in which no further stop counts."""
 
@@ -92,7 +92,7 @@ def contact_keypoints(pose: np.ndarray, gripper_open: np.ndarray) -> np.ndarray:
 
 def import_episode(folder: Path, task: str, number: int, settings: Settings) -> tuple[Episode, bool]:
     """One episode folder, and whether its joints ever rest. Raises DataError where it is damaged."""
-    recording, joint_velocities = read_recording(folder, task, settings.camera, key_poses_only=settings.every_n == 0)
+    recording, joint_velocities = read_recording(folder, task, settings.camera, keyframes_only=settings.every_n == 0)
     check_velocities(joint_velocities, folder)
     if settings.keypoints == "contacts":
         points = contact_keypoints(recording.pose, recording.gripper_open)
@@ -222,7 +222,7 @@ def report(out: Path, skipped: Sequence[Mapping[str, Json]]) -> None:
     listed = ", ".join(f"{task} {count}" for task, count in counts.items())
     print(f"{out}: {sum(counts.values())} episodes ({listed}) of {len(variations)} variations, {frames} samples")
     if restless := sum(entry.get("restless", 0) for entry in shards):
-        print(f"in {restless} of them the joints never rest: key poses are changes of a gripper and the end (--still)")
+        print(f"in {restless} of them the joints never rest: keyframes are changes of a gripper and the end (--still)")
     aside = sum((Counter(entry.get("left_aside", {})) for entry in shards), Counter[str]())
     if aside:
         names = ", ".join(f"{name} ({count})" for name, count in sorted(aside.items()))

@@ -67,12 +67,12 @@ def _episode_number(path: Path) -> tuple[str, list[tuple[int, str]]]:
 
 
 def read_recording(
-    folder: Path, task: str, camera: str = "front", key_poses_only: bool = False
+    folder: Path, task: str, camera: str = "front", keyframes_only: bool = False
 ) -> tuple[Recording, np.ndarray]:
     """An episode's recording and its joint velocities (T, A, 7). Pictures are read when asked for.
 
     The instruction is the first of the descriptions, as in PerAct. The recording has no keypoints: RLBench keeps none.
-    key_poses_only: for copies that kept the pictures of key poses only; the others are missed when asked for.
+    keyframes_only: for copies that kept the pictures of keyframes only; the others are missed when asked for.
     Raises DataError naming file and observation where anything is missing or damaged.
     """
     path = folder / "low_dim_obs.pkl"
@@ -103,8 +103,8 @@ def read_recording(
     recording = Recording(
         task=task,
         instruction=_instruction(folder),
-        rgb=_Pictures(folder, f"{camera}_rgb", count, key_poses_only),
-        depth=_DepthMaps(folder, f"{camera}_depth", count, key_poses_only, near, far),
+        rgb=_Pictures(folder, f"{camera}_rgb", count, keyframes_only),
+        depth=_DepthMaps(folder, f"{camera}_depth", count, keyframes_only, near, far),
         intrinsics=intrinsics,
         world_from_camera=seen("extrinsics", (4, 4)),
         pose=felt("gripper_pose", (7,)),
@@ -176,12 +176,12 @@ def _variation(folder: Path) -> int:
 class _Pictures(Sequence[np.ndarray]):
     """The colour pictures of one camera, read when asked for.
 
-    Raises DataError unless there is one an observation; with `key_poses_only` one that is missing is missed when asked
+    Raises DataError unless there is one an observation; with `keyframes_only` one that is missing is missed when asked
     for. Any number of leading zeros will do. Hidden files are passed over: archives of macOS have them.
     """
 
-    def __init__(self, folder: Path, name: str, count: int, key_poses_only: bool) -> None:
-        self.folder, self.total, self.key_poses_only = folder / name, count, key_poses_only
+    def __init__(self, folder: Path, name: str, count: int, keyframes_only: bool) -> None:
+        self.folder, self.total, self.keyframes_only = folder / name, count, keyframes_only
         files = [path.name for path in sorted(self.folder.glob("[!.]*.png"))]
         if not files:
             kind = name.rsplit("_", 1)[1]
@@ -199,17 +199,17 @@ class _Pictures(Sequence[np.ndarray]):
         if len(files) > len(self.names.keys() & range(count)):
             raise DataError(self.folder, "folder", f"{count} pictures, one an observation", str(len(files)), _FIX)
         missing = [number for number in range(count) if number not in self.names]
-        if missing and not key_poses_only:
+        if missing and not keyframes_only:
             if len(files) < count / 2:
-                fix = f"if they are those of key poses, import with --every-n 0; otherwise {_FIX}"
+                fix = f"if they are those of keyframes, import with --every-n 0; otherwise {_FIX}"
                 got = f"{len(files)} (no {self.form.format(missing[0])})"
                 raise DataError(self.folder, "folder", f"pictures of all {count} observations", got, fix)
             raise self._missing(missing[0])
 
     def _missing(self, number: int) -> DataError:
         expected = f"a picture of each of {self.total} observations"
-        if self.key_poses_only:
-            expected = "a picture of the first observation and of each key pose"
+        if self.keyframes_only:
+            expected = "a picture of the first observation and of each keyframe"
         return DataError(self.folder / self.form.format(number), "file", expected, "no such file", _FIX)
 
     def __len__(self) -> int:
@@ -226,9 +226,9 @@ class _DepthMaps(_Pictures):
     """The depth maps of one camera in metres, 0 where missing."""
 
     def __init__(
-        self, folder: Path, name: str, count: int, key_poses_only: bool, near: np.ndarray, far: np.ndarray
+        self, folder: Path, name: str, count: int, keyframes_only: bool, near: np.ndarray, far: np.ndarray
     ) -> None:
-        super().__init__(folder, name, count, key_poses_only)
+        super().__init__(folder, name, count, keyframes_only)
         self.near, self.far = near, far
 
     # Nobody takes slices.

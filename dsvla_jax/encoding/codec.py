@@ -1,4 +1,4 @@
-"""Key poses as small integers: the 200-bin codec of the action text.
+"""Keyframes as small integers: the 200-bin codec of the action text.
 
 Positions are counted in steps of a 200th of the workspace box, so with the default 2 m box in centimetres of the world
 frame. Quaternion components are counted in hundredths. The gripper is 0 or 1.

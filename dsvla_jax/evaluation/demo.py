@@ -1,6 +1,6 @@
 """Show one episode of a run as an HTML page: python -m dsvla_jax.evaluation.demo RUN [--task lamp_on] [--out demo.html]
 
-For each key pose: the picture with the cloud's 3D tokens and the patches they are aligned with, the keypoints, the
+For each keyframe: the picture with the cloud's 3D tokens and the patches they are aligned with, the keypoints, the
 prompt, the answer with how probable each number was, and where the arm went.
 """
 
@@ -55,7 +55,7 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One key pose: pictures as data URIs, and rows (number, value, probability) for each arm."""
+    """One keyframe: pictures as data URIs, and rows (number, value, probability) for each arm."""
 
     tokens: str
     target: str
@@ -142,7 +142,7 @@ def main(options: Options) -> None:
     def act(seen: Observation, instructions, near: np.ndarray) -> tuple[Action, list[str]]:
         decision = policy.decide(seen, instructions, near)
         steps.append(describe(policy, seen, instructions[0], near[0], decision))
-        print(f"key pose {len(steps)}: {decision.texts[0]}", flush=True)
+        print(f"keyframe {len(steps)}: {decision.texts[0]}", flush=True)
         return decision.action, decision.texts
 
     find = keypoint_source(experiment.keypoints, environment)

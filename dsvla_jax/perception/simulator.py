@@ -32,7 +32,7 @@ def keypoint_source(kind: Keypoints, environment: Environment) -> "Callable[[Sim
     """What makes the source of a batch of the environment's episodes from its reset state.
 
     kind: `oracle`: None, for the task's own keypoints. `segmentation`: found in the first picture.
-    `segmentation-refresh`: in the picture before every key pose.
+    `segmentation-refresh`: in the picture before every keyframe.
     """
     if kind == "oracle":
         return None
@@ -43,7 +43,7 @@ class SegmentationKeypoints:
     """A `rollout.KeypointSource` for one batch of episodes: the simulator's masks of the task's objects and the depth
     seen on them, through the geometry that a robot's pictures go through.
 
-    state: the reset state of the B episodes. refresh: looks again before every key pose, see `KeypointTracker`;
+    state: the reset state of the B episodes. refresh: looks again before every keyframe, see `KeypointTracker`;
     otherwise the first frame's keypoints are kept. Raises UserError for a task that names no objects.
     """
 

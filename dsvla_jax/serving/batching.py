@@ -30,7 +30,7 @@ class Question:
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """The next key pose of one robot: pose float32 (A, 7), gripper_open float32 (A,), and the text that says it.
+    """The next keyframe of one robot: pose float32 (A, 7), gripper_open float32 (A,), and the text that says it.
 
     log_probs: A lists of 8, of each number of the text.
     """
