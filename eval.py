@@ -129,7 +129,7 @@ def main(options: Options) -> None:
     missing = [name for name in tasks if name not in finished]
     if missing:
         require_writable(folder)
-        policy = dsvla_jax.policy.load(options.run, decoding=Decoding(options.choice), step=step)
+        policy = dsvla_jax.policy.load_policy(options.run, decoding=Decoding(options.choice), step=step)
         if options.keypoints and not policy.config.encoding.use_keypoints:
             raise UserError(f"{options.run}: trained without keypoints; leave out --keypoints {options.keypoints}")
         for name in missing:

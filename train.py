@@ -177,8 +177,8 @@ def train(
         return mean_errors(sums, state.trainable, frozen, held_out(), mesh)
 
     checks = (
-        loop.Check("validating", experiment.validate_every, validate),
-        loop.Check("evaluating", experiment.evaluate_every, make_evaluation(experiment, tokenizer, frozen)),
+        loop.PeriodicEval("validating", experiment.validate_every, validate),
+        loop.PeriodicEval("evaluating", experiment.evaluate_every, make_evaluation(experiment, tokenizer, frozen)),
     )
     with (
         MetricsWriter(run, int(state.step), wandb, dataclasses.asdict(experiment)) as metrics,
@@ -334,7 +334,7 @@ def base_variables(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str,
     folder = Path(experiment.base)
     if is_imported(folder):
         return load_for_model(folder, experiment.model, mesh, frozen=experiment.regime != "full")
-    policy = dsvla_jax.policy.load(folder, mesh)
+    policy = dsvla_jax.policy.load_policy(folder, mesh)
     if policy.tokenizer != tokenizer_of(experiment):
         raise UserError(
             f"base: {folder} was trained with another vocabulary, whose tokens its embedding stands for; train with "

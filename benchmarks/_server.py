@@ -69,7 +69,7 @@ class Known:
 
 def known_answers(run: Path, episodes: int) -> list[Known]:
     """The starts of so many simulated episodes of each of the run's tasks for one arm, answered without a server."""
-    policy, data = dsvla_jax.policy.load(run), load_experiment(run / "config.json").data
+    policy, data = dsvla_jax.policy.load_policy(run), load_experiment(run / "config.json").data
     known = []
     for name in select_tasks(data.tasks):
         if get_task(name).num_arms != 1:

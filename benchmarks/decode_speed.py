@@ -31,7 +31,7 @@ from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.prompts import format_prompt
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.decode import make_decoder
-from dsvla_jax.model.layers_apart import take_apart
+from dsvla_jax.model.unstacked import unstack_layers
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import ModelInputs
 from dsvla_jax.weights.backbones import import_backbones, load_backbones
@@ -129,7 +129,7 @@ def main(options: Options) -> int:
     visual: Any = VLA(config).apply(variables, inputs, method=lambda model, x: model.projector(model.encode_vision(x)))
     embedded = theirs.get_input_embeddings()(torch.from_numpy(text.tokens[None, :length]).long()).detach().numpy()
     embeddings = np.concatenate([np.asarray(visual), embedded], axis=1)
-    variables = take_apart(variables)
+    variables = unstack_layers(variables)
     decoded = decode(variables, inputs)
     answer = len(grammar.tokens(np.asarray(decoded.integers[0])))
     parameters = sum(parameter.numel() for parameter in theirs.parameters())

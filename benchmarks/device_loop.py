@@ -62,7 +62,7 @@ def first_keypoints(environment: Environment, state: SimState, kind: Keypoints) 
 
 
 def main(options: Options) -> int:
-    policy, experiment = dsvla_jax.policy.load(options.run), load_experiment(options.run / "config.json")
+    policy, experiment = dsvla_jax.policy.load_policy(options.run), load_experiment(options.run / "config.json")
     different = 0
     for task in options.tasks:
         environment = Environment(task, "mjx", image_size=experiment.data.image_size)

@@ -27,7 +27,7 @@ from dsvla_jax.encoding.encode import encode_text
 from dsvla_jax.encoding.grammar import SEPARATOR, build_answer_grammar
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.prompts import STYLES, format_answer, format_prompt
-from dsvla_jax.model.number_tree import number_tree
+from dsvla_jax.model.integer_trie import integer_trie
 from dsvla_jax.sim.tasks import TASKS
 
 PACKAGE = "llama-tokenizer-js@1.2.2"
@@ -125,7 +125,7 @@ def main(options: Options) -> int:
         print(f"{style}, {arms} arm(s): prompts of {asked} tokens with begin, answers of {answered} with end")
         wrong += max(map(sum, lengths)) > LONGEST
         grammar = build_answer_grammar(tokenizer, arms, style)
-        read = [len(number_tree(slot).branches.tokens) for slot in grammar.slots[:8]]
+        read = [len(integer_trie(slot).branches.tokens) for slot in grammar.slots[:8]]
         print(f"  branches of an arm's number trees: {read}")
     return int(wrong > 0)
 

@@ -44,7 +44,7 @@ def main(options: Options) -> int:
         return NO_CLIENT
     experiment, enough = load_experiment(options.run / "config.json"), True
     data = experiment.data
-    policy = dsvla_jax.policy.load(options.run)
+    policy = dsvla_jax.policy.load_policy(options.run)
     with server_process(options.run, "--batch", "1") as (port, _):
         for name in select_tasks(data.tasks):
             remote = []

@@ -14,6 +14,7 @@ from dsvla_jax.files import replacing
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.partition import MESH_AXES
 from dsvla_jax.model.same_sizes import require_same_sizes
+from dsvla_jax.model.variables import Regime
 from dsvla_jax.ranges import at_least, check_fields, more_than, require
 
 
@@ -130,7 +131,7 @@ class Experiment:
     """Comparison with held-out demonstrations."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """Closed-loop episodes."""
-    regime: Literal["full", "lora", "adapters"] = "full"
+    regime: Regime = "full"
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
     base: str = ""
     """A finished run, or a folder of imported weights (docs/weights.md), whose parameters come in the place of random

@@ -28,9 +28,9 @@ from dsvla_jax.encoding.text import Tokenizer, quoted, unknown_words
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
-from dsvla_jax.model.layers_apart import take_apart
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.same_sizes import require_same_sizes
+from dsvla_jax.model.unstacked import unstack_layers
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.types import Action, Array, Observation, RobotState, Text
@@ -96,11 +96,11 @@ def _decode(
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A policy ready to act. Build one with `load`."""
+    """A policy ready to act. Build one with `load_policy`."""
 
     config: PolicyConfig
     variables: Variables
-    """The model's, or these from `take_apart`."""
+    """The model's, or these from `unstack_layers`."""
     tokenizer: Tokenizer
     decoding: Decoding = GREEDY
 
@@ -180,7 +180,7 @@ def full_size(size: int) -> int:
 
 
 def save_policy_config(run: Path, config: PolicyConfig, tokenizer: Tokenizer) -> None:
-    """Writes what `load` needs besides a checkpoint."""
+    """Writes what `load_policy` needs besides a checkpoint."""
     config = dataclasses.replace(config, vocabulary=vocabulary_digest(tokenizer))
     (run / "policy.json").write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
     save_tokenizer(tokenizer, run)
@@ -210,7 +210,7 @@ def load_vocabulary(run: Path, config: PolicyConfig) -> Tokenizer:
     return tokenizer
 
 
-def load(
+def load_policy(
     run: Path,
     mesh: jax.sharding.Mesh | None = None,
     decoding: Decoding = GREEDY,
@@ -229,5 +229,5 @@ def load(
     with contextlib.closing(RunCheckpoints(run, read_only=True)) as checkpoints:
         variables = checkpoints.restore_variables(like, step)
     if mesh is None and jax.default_backend() == "cpu":
-        variables = take_apart(variables)
+        variables = unstack_layers(variables)
     return Policy(config, variables, tokenizer, decoding)

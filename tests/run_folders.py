@@ -18,7 +18,7 @@ from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.partition import shardings
-from dsvla_jax.model.variables import split_variables
+from dsvla_jax.model.variables import Regime, split_variables
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import PolicyConfig, save_policy_config
 from dsvla_jax.training.sharding import make_mesh
@@ -37,7 +37,7 @@ def variables_only(trainable: Any) -> Arrays:
 
 
 def write_run(
-    run: Path, model: ModelConfig, regime: str = "lora", mesh: jax.sharding.Mesh | None = None
+    run: Path, model: ModelConfig, regime: Regime = "lora", mesh: jax.sharding.Mesh | None = None
 ) -> dict[str, Any]:
     """Writes a run of ``model``, split over ``mesh`` if given, and returns its variables: no zeros, no ones, adapters
     that do something.

@@ -12,7 +12,7 @@ from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.prompts import format_answer, parse_answer
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig
 from dsvla_jax.model.decode import Decoding, decode_actions, make_decoder
-from dsvla_jax.model.layers_apart import put_together, take_apart
+from dsvla_jax.model.unstacked import stack_layers, unstack_layers
 from dsvla_jax.model.vla import VLA, extend, initialize, lm_head, prefill
 from dsvla_jax.types import ModelInputs
 from tests.decoding import (
@@ -186,8 +186,8 @@ def test_choosing_says_what_it_needs(variables):
 
 
 def test_weights_taken_apart_give_the_same_answers(variables):
-    apart = take_apart(variables)
-    jax.tree.map(np.testing.assert_array_equal, put_together(apart), variables)
+    apart = unstack_layers(variables)
+    jax.tree.map(np.testing.assert_array_equal, stack_layers(apart), variables)
     whole, parts = (decoder(CONFIG, GRAMMAR)(weights, make_prompts()) for weights in (variables, apart))
     np.testing.assert_array_equal(whole.integers, parts.integers)
     np.testing.assert_allclose(whole.log_probs, parts.log_probs, atol=1e-4)
@@ -196,7 +196,7 @@ def test_weights_taken_apart_give_the_same_answers(variables):
 def test_weights_taken_apart_are_never_stacked_in_memory(variables):
     layers, width, ffn = CONFIG.language.layers, CONFIG.language.width, CONFIG.language.ffn
     stacks = f"f32[{layers},{width},{ffn}]", f"f32[{layers},{ffn},{width}]"
-    programs = [decoder(CONFIG, GRAMMAR).lower(w, make_prompts()) for w in (variables, take_apart(variables))]  # pyright: ignore[reportFunctionMemberAccess]
+    programs = [decoder(CONFIG, GRAMMAR).lower(w, make_prompts()) for w in (variables, unstack_layers(variables))]  # pyright: ignore[reportFunctionMemberAccess]
     whole, parts = (program.compile().as_text() for program in programs)
     assert all(stack in whole for stack in stacks)
     assert not any(stack in parts for stack in stacks)

@@ -69,7 +69,7 @@ def train(
     experiment: Experiment = EXPERIMENT,
     bad: Collection[int] = (),
     at_step: Callable[[int], None] = lambda step: None,
-    checks: Sequence[loop.Check] = (),
+    checks: Sequence[loop.PeriodicEval] = (),
 ) -> signal.Signals | None:
     """Trains as train.py does; `at_step` is called before each step of this process."""
     run.mkdir(exist_ok=True)
@@ -137,7 +137,7 @@ def test_a_signal_while_episodes_run_gives_them_up_and_saves(tmp_path: Path, uni
             os.kill(os.getpid(), signal.SIGTERM)
         return {} if stop() else {"evaluation/success": 1 / int(state.step)}
 
-    checks = [loop.Check("evaluating", 1, evaluate)]
+    checks = [loop.PeriodicEval("evaluating", 1, evaluate)]
     assert train(tmp_path, checks=checks) == signal.SIGTERM
     with closing(RunCheckpoints(tmp_path, read_only=True)) as checkpoints:
         assert (checkpoints.best_step, checkpoints.latest_step) == (1, 5)

@@ -48,7 +48,7 @@ def policy_to_run(job: Job) -> tuple[Policy, Experiment, bool]:
     """What section `tiny` has trained, with its experiment, and True; without it a random policy of that size."""
     run = tiny_run(job.folder)
     if (run / "metrics.jsonl").exists():
-        return dsvla_jax.policy.load(run), load_experiment(run / "config.json"), True
+        return dsvla_jax.policy.load_policy(run), load_experiment(run / "config.json"), True
     experiment = get_config("tiny")
     config = PolicyConfig(experiment.encoding, experiment.model)
     return Policy(config, initialize(experiment.model, jax.random.key(0)), suite_tokenizer()), experiment, False

@@ -134,7 +134,7 @@ def main(options: Options) -> None:
         raise UserError(f"--task: expected one task, got {options.task!r}; the first of its tasks is {task}")
     out = options.out or options.run / "demo.html"
     require_writable(out.parent)
-    policy, environment = dsvla_jax.policy.load(options.run), Environment(task, image_size=data.image_size)
+    policy, environment = dsvla_jax.policy.load_policy(options.run), Environment(task, image_size=data.image_size)
     print(f"{task}, episode {options.seed}: compiling takes a minute the first time", flush=True)
     state = environment.reset(episode_keys(0, "eval", task, options.seed, 1))
     steps: list[Step] = []

@@ -2,7 +2,7 @@
 
 The answer's form is known beforehand: fixed templates with a number in between. The prompt is read once into a
 key/value cache. Then every number costs one pass, whatever its tokens: the pass reads the number before it, the
-template between the two, and the tree of the number's own integers (``number_tree``), and gives the probability of
+template between the two, and the tree of the number's own integers (``integer_trie``), and gives the probability of
 each integer that the slot admits. docs/decoding.md has the picture.
 """
 
@@ -18,17 +18,17 @@ from flax import struct
 
 from dsvla_jax.encoding.codec import QUATERNION_VALUES, VALUES_PER_ARM
 from dsvla_jax.encoding.grammar import AnswerGrammar
-from dsvla_jax.model.layers_apart import is_apart, put_together
-from dsvla_jax.model.llama import KVCache
-from dsvla_jax.model.number_tree import (
+from dsvla_jax.model.integer_trie import (
     Branches,
+    IntegerTrie,
     Numbers,
-    NumberTree,
+    integer_trie,
     log_probabilities,
-    number_tree,
     stack_choices,
     stack_numbers,
 )
+from dsvla_jax.model.llama import KVCache
+from dsvla_jax.model.unstacked import is_unstacked, stack_layers
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA, extend, lm_head, prefill
 from dsvla_jax.types import Array, ModelInputs, Text
@@ -75,7 +75,7 @@ class Decoded:
 
 
 @struct.dataclass
-class _Written:
+class _Answer:
     """The answer as far as it goes: integers int32 (B, K), log_probs and entropies float32 (B, K)."""
 
     integers: Array
@@ -84,7 +84,7 @@ class _Written:
 
 
 @struct.dataclass
-class _Read:
+class _CacheState:
     """What the language model has read: its cache, valid bool (B, S) where that holds a token, lengths int32 (B,)."""
 
     cache: KVCache
@@ -93,7 +93,7 @@ class _Read:
 
 
 @struct.dataclass
-class _Pass:
+class _DecodeStep:
     """What one pass reads, and how it leads to the number of a slot.
 
     slot: int32 (), which. offset: where in the cache it writes. before: the numbers of the slot before, of which it
@@ -104,7 +104,7 @@ class _Pass:
     offset: int | np.ndarray | Array
     before: Numbers
     template: np.ndarray | Array
-    tree: NumberTree
+    tree: IntegerTrie
 
     def shape(self) -> tuple[int, ...]:
         return self.before.tokens.shape[1], len(self.template), len(self.tree.branches.tokens)
@@ -120,7 +120,7 @@ def decode_actions(
 ) -> Decoded:
     """The answers of a batch. Under ``jax.jit``, close over the model, grammar and decoding (see ``make_decoder``).
 
-    variables: of the model, or these from `take_apart`.
+    variables: of the model, or these from `unstack_layers`.
     inputs: batched, the text being prompts without answers, padded at the end to one length; padding and the other
         examples of the batch have no influence on an answer.
     key: for `sample`; an example draws by its place in the batch.
@@ -128,10 +128,10 @@ def decode_actions(
     _check_vocabulary(grammar, model.config.language.vocab_size)
     if decoding.choice == "sample" and key is None:
         raise ValueError("decode_actions: choice 'sample' draws integers; give it a key")
-    if is_apart(variables):
+    if is_unstacked(variables):
         layers = max(model.config.vision.layers, model.config.language.layers)
         model = VLA(dataclasses.replace(model.config, scan_unroll=layers))
-    trees = [number_tree(slot) for slot in grammar.slots]
+    trees = [integer_trie(slot) for slot in grammar.slots]
     # What precedes the first number is read with the prompt; behind the last number nothing is read.
     inputs = _append(inputs, np.array(grammar.templates[0], np.int32))
     templates = [np.array(template, np.int32) for template in grammar.templates[1:-1]]
@@ -140,28 +140,28 @@ def decode_actions(
     offsets = np.cumsum([0, *kept])
     room = max(offset + len(tree.branches.tokens) for offset, tree in zip(offsets, trees, strict=True))
 
-    root, cache = prefill(model, put_together(variables), inputs, int(room))
+    root, cache = prefill(model, stack_layers(variables), inputs, int(room))
     before = cache.keys.shape[3] - room
     lengths = before - inputs.text.tokens.shape[1] + inputs.text.mask.sum(axis=1).astype(jnp.int32)
     if decoding.samples > 1:
         root, cache, lengths = _repeat((root, cache, lengths), decoding.samples)
     batch = len(lengths)
     keys = None if key is None else jax.vmap(lambda b: jax.random.fold_in(key, b))(jnp.arange(batch))
-    read = _Read(cache, jnp.arange(cache.keys.shape[3]) < lengths[:, None], lengths)
-    written = _Written(*(jnp.zeros((batch, len(trees)), dtype) for dtype in (jnp.int32, jnp.float32, jnp.float32)))
+    read = _CacheState(cache, jnp.arange(cache.keys.shape[3]) < lengths[:, None], lengths)
+    written = _Answer(*(jnp.zeros((batch, len(trees)), dtype) for dtype in (jnp.int32, jnp.float32, jnp.float32)))
 
-    def choose(written: _Written, slot: int | Array, hidden: Array, tree: NumberTree) -> _Written:
-        logits = lm_head(model, put_together(variables), hidden, tree.choices.tokens)
+    def choose(written: _Answer, slot: int | Array, hidden: Array, tree: IntegerTrie) -> _Answer:
+        logits = lm_head(model, stack_layers(variables), hidden, tree.choices.tokens)
         log_probs = _admitted(log_probabilities(logits, tree.choices), written, slot, tree.numbers)
         index = _choose(log_probs, tree.numbers, decoding, keys, slot)[:, None]
         entropy = -jnp.where(jnp.isfinite(log_probs), jnp.exp(log_probs) * log_probs, 0.0).sum(axis=-1)
-        return _Written(
+        return _Answer(
             written.integers.at[:, slot].set(jnp.asarray(tree.numbers.values)[index[:, 0]]),
             written.log_probs.at[:, slot].set(jnp.take_along_axis(log_probs, index, axis=1)[:, 0]),
             written.entropies.at[:, slot].set(entropy),
         )
 
-    def run(carry: tuple[_Read, _Written], one: _Pass) -> tuple[tuple[_Read, _Written], None]:
+    def run(carry: tuple[_CacheState, _Answer], one: _DecodeStep) -> tuple[tuple[_CacheState, _Answer], None]:
         read, written = carry
         row = written.integers[:, one.slot - 1] - jnp.asarray(one.before.values)[0]
         number, length = jnp.asarray(one.before.tokens)[row], jnp.asarray(one.before.lengths)[row]
@@ -180,11 +180,11 @@ def decode_actions(
         passes, hidden = passes + 1, jnp.concatenate([hidden, x], axis=1)
     carry = read, choose(written, 0, hidden, trees[0])
     following = [
-        _Pass(slot, offset, trees[slot - 1].numbers, template, trees[slot])
+        _DecodeStep(slot, offset, trees[slot - 1].numbers, template, trees[slot])
         for slot, offset, template in zip(range(1, len(trees)), offsets, templates, strict=False)
     ]
     # Neighbouring passes of one shape run as one loop, so that compile time does not grow with them.
-    for _, alike in itertools.groupby(following, _Pass.shape):
+    for _, alike in itertools.groupby(following, _DecodeStep.shape):
         group = list(alike)
         carry, _ = jax.lax.scan(run, carry, _stack(group))
         passes += len(group)
@@ -205,13 +205,13 @@ def make_decoder(model: VLA, grammar: AnswerGrammar, decoding: Decoding = GREEDY
 def _extend(
     model: VLA,
     variables: Variables,
-    read: _Read,
+    read: _CacheState,
     index: int | Array,
     number: Array,
     length: Array,
     template: np.ndarray | Array,
     branches: Branches,
-) -> tuple[Array, _Read]:
+) -> tuple[Array, _CacheState]:
     """Reads a number (B, W), of which the first ``length`` (B,) tokens count, a template and a tree's branches.
 
     They are written at ``index`` of the cache. Returns the hidden states (B, W + C + F, width), and what has been read:
@@ -235,12 +235,12 @@ def _extend(
     mask = jnp.broadcast_to(read.valid[:, None], (*tokens.shape, read.valid.shape[1]))
     mask = jax.lax.dynamic_update_slice_in_dim(mask, among, index, axis=2)
     positions = read.lengths[:, None] + behind
-    x, cache = extend(model, put_together(variables), tokens, positions, mask, read.cache, index)
+    x, cache = extend(model, stack_layers(variables), tokens, positions, mask, read.cache, index)
     valid = jax.lax.dynamic_update_slice_in_dim(read.valid, counts, index, axis=1)
-    return x, _Read(cache, valid, read.lengths + length + len(template))
+    return x, _CacheState(cache, valid, read.lengths + length + len(template))
 
 
-def _admitted(log_probs: Array, written: _Written, slot: int | Array, numbers: Numbers) -> Array:
+def _admitted(log_probs: Array, written: _Answer, slot: int | Array, numbers: Numbers) -> Array:
     """Distributions (B, N) over integers, minus infinity exactly where none may be chosen, whatever the logits were.
 
     Besides rows that are no integer, that is 0 for the last part of a quaternion whose other parts are 0, which would
@@ -266,15 +266,15 @@ def _choose(log_probs: Array, numbers: Numbers, decoding: Decoding, keys: Array 
     return log_probs.argmax(axis=-1)
 
 
-def _stack(group: list[_Pass]) -> _Pass:
+def _stack(group: list[_DecodeStep]) -> _DecodeStep:
     """Passes of one shape in arrays with an axis in front."""
     branches: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *(one.tree.branches for one in group))
-    return _Pass(
+    return _DecodeStep(
         slot=np.array([one.slot for one in group], np.int32),
         offset=np.array([one.offset for one in group], np.int32),
         before=stack_numbers([one.before for one in group]),
         template=np.stack([one.template for one in group]),
-        tree=NumberTree(
+        tree=IntegerTrie(
             branches,
             stack_choices([one.tree.choices for one in group]),
             stack_numbers([one.tree.numbers for one in group]),
@@ -294,7 +294,7 @@ def _repeat(tree: Any, times: int) -> Any:
     return jnp.repeat(root, times, axis=0), cache, jnp.repeat(lengths, times, axis=0)
 
 
-def _most_probable(written: _Written, samples: int) -> _Written:
+def _most_probable(written: _Answer, samples: int) -> _Answer:
     """Of each example's samples the one of highest probability."""
     best = written.log_probs.sum(axis=1).reshape(-1, samples).argmax(axis=1)
     rows = jnp.arange(len(best)) * samples + best

@@ -1,28 +1,39 @@
 """Which of a model's variables learn and which are frozen, as operations on nested dicts."""
 
-from typing import Any
+from typing import Any, Literal, TypeAlias, assert_never
 
 import jax.numpy as jnp
 from flax import traverse_util
 
-PROJECTION = "projector"
+PROJECTOR = "projector"
 
 # Parameters that are cast to the model's dtype before anything is computed with them. Norms and positions are not.
 MATRICES = ("kernel", "embedding", "output", "projection", "patch_kernel")
 
-Variables = dict[str, Any]
+Variables: TypeAlias = dict[str, Any]
+
+Regime = Literal["full", "lora", "adapters"]
+"""What is trained."""
 
 
-def split_variables(variables: Variables, regime: str) -> tuple[Variables, Variables]:
+def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Variables]:
     """The variables as (trainable, frozen).
 
-    `full`: everything learns. `lora`: the "lora" collection and the projection learn (paper, section 3.1). `adapters`:
-    the "lora" collection alone, on a base whose projection is pretrained (as in the authors' released training code).
+    `full`: everything learns. `lora`: the "lora" collection and the projector learn (paper, section 3.1). `adapters`:
+    the "lora" collection alone, on a base whose projector is pretrained (as in the authors' released training code).
     """
     flat = traverse_util.flatten_dict(variables)
 
     def learns(path: tuple[str, ...]) -> bool:
-        return regime == "full" or path[0] == "lora" or (regime == "lora" and path[1] == PROJECTION)
+        match regime:
+            case "full":
+                return True
+            case "lora":
+                return path[0] == "lora" or path[1] == PROJECTOR
+            case "adapters":
+                return path[0] == "lora"
+            case _:
+                assert_never(regime)
 
     trainable = {path: leaf for path, leaf in flat.items() if learns(path)}
     frozen = {path: leaf for path, leaf in flat.items() if not learns(path)}

@@ -78,7 +78,7 @@ def build_server(options: Options) -> PolicyServer:
         grounding = options.grounding
         phrases = (*grounding.table(), *suite_phrases())
         perception = Perception(grounding.segmenter(), phrases, options.perception == "refresh")
-    policy = dataclasses.replace(policies.load(options.run), config=config)
+    policy = dataclasses.replace(policies.load_policy(options.run), config=config)
     return PolicyServer(policy, sizes, arms, options.limits, token, options.run.name, perception)
 
 

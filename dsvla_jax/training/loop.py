@@ -33,19 +33,18 @@ class Batches(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Check:
-    """What is found out about a state every so many steps, and at the end; 0 for never.
+class PeriodicEval:
+    """What is measured of a state every so many steps, and at the end."""
 
-    doing: in a word, for people. look: gives figures by name; may ask its second argument whether to give up, and then
-    gives none.
-    """
-
-    doing: str
+    name: str
+    """For people, such as "validating"."""
     every: int
-    look: Callable[[TrainState, Callable[[], bool]], dict[str, float]]
+    """Steps; 0 for never."""
+    run: Callable[[TrainState, Callable[[], bool]], dict[str, float]]
+    """(state, whether to stop) -> figures by name; none if it stopped."""
 
     def is_due(self, step: int, last: int) -> bool:
-        """Whether after this step."""
+        """Returns whether it runs after this step."""
         return self.every > 0 and (is_due(step, self.every) or step == last)
 
 
@@ -63,7 +62,7 @@ def train(
     batches: Batches,
     checkpoints: RunCheckpoints,
     metrics: MetricsWriter,
-    checks: Sequence[Check] = (),
+    checks: Sequence[PeriodicEval] = (),
     note: Callable[[str], None] = lambda doing: None,
 ) -> signal.Signals | None:
     """Trains from the state's step to the experiment's last, saving on the way and at the end.
@@ -104,11 +103,11 @@ def train(
             for check in checks:
                 # Whoever asks to stop is not kept waiting.
                 if check.is_due(done, experiment.steps) and not request.noted:
-                    note(f"{check.doing} step {done}")
-                    bar.set_postfix_str(check.doing)
+                    note(f"{check.name} step {done}")
+                    bar.set_postfix_str(check.name)
                     jax.block_until_ready(values)
                     with clock.paused():
-                        figures |= check.look(state, lambda: request.noted)
+                        figures |= check.run(state, lambda: request.noted)
             if figures:
                 metrics.write(done, figures)
             stop, score = request.after(done), score_of(figures)

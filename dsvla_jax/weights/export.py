@@ -27,7 +27,7 @@ from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.lora import merge_lora, require_mergeable
-from dsvla_jax.model.variables import PROJECTION
+from dsvla_jax.model.variables import PROJECTOR
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.weights.imported_folder import new_folder
 from dsvla_jax.weights.readers.hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
@@ -104,12 +104,12 @@ def _write_run(run: Path, folder: Path, model: ModelConfig, tokenizer: Tokenizer
             _describe_model(folder / tower, tower, model, tokenizer, np.dtype(options.dtype).name)
         else:
             write_adapters(folder / tower, tower, parts, names, model, options.dtype, options.bases.get(tower))
-    (folder / PROJECTION).mkdir()
-    projection = {".".join(p[2:]): leaf for p, leaf in variables.items() if p[:2] == ("params", PROJECTION)}
+    (folder / PROJECTOR).mkdir()
+    projection = {".".join(p[2:]): leaf for p, leaf in variables.items() if p[:2] == ("params", PROJECTOR)}
     sizes = {name: leaf.size * np.dtype(options.dtype).itemsize for name, leaf in projection.items()}
     arrays = ((name, leaf.read().astype(options.dtype)) for name, leaf in projection.items())
-    write_tensors(folder / PROJECTION, sizes, arrays, options.shard_bytes)
-    return [*towers, PROJECTION]
+    write_tensors(folder / PROJECTOR, sizes, arrays, options.shard_bytes)
+    return [*towers, PROJECTOR]
 
 
 def _tensor_names(tower: str, model: ModelConfig) -> dict[str, str]:

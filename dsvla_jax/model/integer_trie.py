@@ -59,7 +59,7 @@ class Choices:
 
 
 @struct.dataclass
-class NumberTree:
+class IntegerTrie:
     """How the integers of one slot are read."""
 
     branches: Branches
@@ -67,7 +67,7 @@ class NumberTree:
     numbers: Numbers
 
 
-def number_tree(slot: NumberSlot) -> NumberTree:
+def integer_trie(slot: NumberSlot) -> IntegerTrie:
     """The tree of a slot's integers."""
     numbers = set(slot.tokens)
     children: dict[Tokens, set[int]] = {}
@@ -97,7 +97,7 @@ def number_tree(slot: NumberSlot) -> NumberTree:
         steps = [node[tokens[:p]] * width + column[t] for p, t in enumerate(tokens) if tokens[:p] in node]
         paths.append(steps + ([node[tokens] * width + width - 1] if tokens in node else []))
     sees = [[below[: len(above)] == above for above in read] for below in read]
-    return NumberTree(
+    return IntegerTrie(
         Branches(
             tokens=np.array([path[-1] for path in read], np.int32),
             depths=np.array([len(path) for path in read], np.int32),

@@ -2,7 +2,7 @@
 
 A loop over stacked layers copies each layer's kernels out of the stack before it multiplies, and XLA's CPU products of
 few rows are slow where a kernel has its inputs in rows. At a decoder's few tokens a pass, both together take as long as
-the products themselves. ``take_apart`` is done once, outside of ``jax.jit``; ``put_together`` inside of it stacks the
+the products themselves. `unstack_layers` is done once, outside of `jax.jit`; `stack_layers` inside of it stacks the
 kernels again, which costs nothing if the loop over layers is unrolled: XLA reads the parts where they are.
 """
 
@@ -23,7 +23,7 @@ class Kernels:
     layers: tuple[Array, ...]
 
 
-def take_apart(variables: Variables) -> Variables:
+def unstack_layers(variables: Variables) -> Variables:
     """The same variables with the floating-point kernels of stacked layers as `Kernels`. Not for sharded arrays."""
     flat: dict[tuple, Any] = dict(traverse_util.flatten_dict(variables))
     for path, leaf in flat.items():
@@ -33,12 +33,12 @@ def take_apart(variables: Variables) -> Variables:
     return traverse_util.unflatten_dict(flat)
 
 
-def is_apart(variables: Any) -> bool:
-    """Whether ``take_apart`` made them."""
+def is_unstacked(variables: Any) -> bool:
+    """Whether ``unstack_layers`` made them."""
     return any(map(_is_kernels, jax.tree.leaves(variables, is_leaf=_is_kernels)))
 
 
-def put_together(variables: Any) -> Variables:
+def stack_layers(variables: Any) -> Variables:
     """The variables as the model takes them. Call it where they are used: a loop would be given the stack itself."""
 
     def stack(leaf: Any) -> Array:
