@@ -66,7 +66,7 @@ def ours(folder: Path, frames: int, passes: int = 1) -> dict:
     """Frames/s of our loader, and its memory after each pass."""
     from data_pipelines.oxe.loader import OxeLoader
     from dsvla_jax.data_config import OxeConfig
-    from dsvla_jax.encoding.encode import EncodingConfig
+    from dsvla_jax.encoding.config import EncodingConfig
     from dsvla_jax.suite_vocabulary import suite_tokenizer
 
     config = OxeConfig(folder=str(folder), mixture=(NAME,), image_size=SIZE, crop=CROP, streams=1)
@@ -81,7 +81,7 @@ def demonstrations(folder: Path, frames: int, passes: int = 1) -> dict:
     from data_pipelines.loader import make_loader
     from data_pipelines.samples import make_sampler
     from dsvla_jax.data_config import DataConfig
-    from dsvla_jax.encoding.encode import EncodingConfig
+    from dsvla_jax.encoding.config import EncodingConfig
     from dsvla_jax.suite_vocabulary import suite_tokenizer
 
     data = DataConfig(shift_world=0.05, crop=CROP, state_jitter=0.01, colour_variation=0.2)

@@ -9,7 +9,7 @@ warm-up, no clipping. That rate was set for going on from their own checkpoint, 
 """
 
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, ModelConfig, VisionConfig, VisualPromptConfig
 

@@ -4,7 +4,7 @@ What differs from the paper profile, and why, is in docs/architecture.md under "
 """
 
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.config import LanguageConfig, ModelConfig, VisionConfig

@@ -11,8 +11,8 @@ from data_pipelines.records import Frame
 from data_pipelines.sources import open_demonstrations
 from data_pipelines.workspace import PointCount, View, fit_box, require_points
 from dsvla_jax.data_config import DataConfig, OxeConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import is_constant
-from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.observation_checks import check_camera, check_pictures, has_words

@@ -11,7 +11,8 @@ import numpy as np
 from data_pipelines.augment import jitter_state, perturb_keypoint, random_crop, random_offset, shift_world, vary_colour
 from data_pipelines.episodes import Frame
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
+from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.encode import build_prompt, encode_text
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.encoding.text import Tokenizer

@@ -8,7 +8,7 @@ from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.samples import require_texts_fit
 from dsvla_jax.data_config import DataConfig, OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.text import Tokenizer, check_words, unknown_words
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.tasks import TASKS, select_tasks

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.observation_checks import MIN_WORKSPACE_SHARE, check_workspace, points_in_workspace
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import DataConfig, OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.files import replacing
 from dsvla_jax.model.config import ModelConfig

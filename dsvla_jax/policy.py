@@ -19,8 +19,9 @@ from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import DisplacementScale, displace
-from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text, model_inputs
+from dsvla_jax.encoding.encode import build_prompt, encode_text, model_inputs
 from dsvla_jax.encoding.grammar import build_answer_grammar
 from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer, save_tokenizer, vocabulary_digest
 from dsvla_jax.encoding.prompts import format_answer

@@ -3,7 +3,7 @@
 from data_pipelines.oxe.fixtures.write import known_episodes, write_fixture
 from data_pipelines.oxe.loader import OxeLoader
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 

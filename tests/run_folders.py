@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from dsvla_jax.checkpoints.run import Arrays, Notes, RunCheckpoints
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.experiment import MeshConfig

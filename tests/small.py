@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.model.config import LanguageConfig, VisionConfig
 

@@ -1,5 +1,6 @@
 """What a run folder keeps: exact, checked on the way back, and usable whatever happens to the newest checkpoint."""
 
+import dataclasses
 import resource
 import shutil
 from collections.abc import Iterator
@@ -62,7 +63,7 @@ def assert_same(one, other) -> None:
 
 
 def test_a_checkpoint_gives_back_the_whole_state(tmp_path: Path):
-    saved = state(3).replace(step=jnp.int32(3), skipped=jnp.int32(1))
+    saved = dataclasses.replace(state(3), step=jnp.int32(3), skipped=jnp.int32(1))
     with closing(RunCheckpoints(tmp_path)) as checkpoints:
         checkpoints.save(3, arrays_of(saved), NOTES)
     with closing(RunCheckpoints(tmp_path)) as checkpoints:

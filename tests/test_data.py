@@ -229,8 +229,7 @@ def resumed(folder, state, **choice):
 
 def test_positions_of_earlier_versions_are_still_taken(folder):
     iterator = make_loader(EpisodeReader(folder), place, batch_size=4, seed=1)
-    for _ in range(4):
-        batch = next(iterator)
+    *_, batch = (next(iterator) for _ in range(4))
     # What was saved before the demonstrations were noted beside the number, and before an index held digests.
     index = json.loads((folder / "index.json").read_text())
     for entry in index["shards"]:

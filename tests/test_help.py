@@ -17,7 +17,7 @@ import tyro
 PROGRAMS = (
     *("train tiny", "train tiny_lora", "train tiny_oxe", "train paper_7b", "eval"),
     *("dsvla_jax.weights import", "dsvla_jax.weights export", "dsvla_jax.serving", "dsvla_jax.evaluation.demo"),
-    *("dsvla_jax.training.plan paper_7b", "data_pipelines.demos", "data_pipelines.find_keypoints"),
+    *("plan paper_7b", "data_pipelines.demos", "data_pipelines.find_keypoints"),
     *("data_pipelines.inspect", "data_pipelines.rlbench", "data_pipelines.vocabulary"),
     *("data_pipelines.oxe list", "data_pipelines.oxe prepare", "data_pipelines.oxe vocabulary"),
     "data_pipelines.oxe fixtures",

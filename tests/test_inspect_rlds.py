@@ -16,7 +16,7 @@ from data_pipelines.oxe.fixtures.write import known_episodes, write_fixture
 from data_pipelines.oxe.loader import OxeLoader
 from data_pipelines.rlds.writing import encode_image, write_build
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 

@@ -17,7 +17,7 @@ from data_pipelines.oxe.targets import make_targets
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.tfrecord import write_records
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.errors import DataError
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 
@@ -58,7 +58,7 @@ def in_record(change):
 
     def damage(folder, name):
         records = records_of(folder, name)
-        example = tf_example_pb2.Example.FromString(records[1])
+        example = tf_example_pb2.Example.FromString(records[1])  # pyright: ignore[reportAttributeAccessIssue]
         change(example.features.feature)
         records[1] = example.SerializeToString()
         write_records(shard_of(folder, name, 0), records)
@@ -301,7 +301,7 @@ def test_columns_of_another_version_are_refused(tmp_path, name, path, width, mes
     write_fixture(tmp_path, name, 1, STEPS, shards=1)
     build = RldsBuild(tmp_path / name)
     (record,) = records_of(tmp_path, name)
-    example = tf_example_pb2.Example.FromString(record)
+    example = tf_example_pb2.Example.FromString(record)  # pyright: ignore[reportAttributeAccessIssue]
     example.features.feature[path].float_list.value[:] = np.ones(build.parse(record, "").num_steps * width)
     build.features[path] = Tensor(shape=(width,), dtype=np.float32)
     with pytest.raises(DataError, match=f"shard 7, record 3: {message}; is this the version"):

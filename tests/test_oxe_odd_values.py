@@ -18,8 +18,8 @@ from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.writing import write_build
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import DisplacementScale
-from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 

@@ -170,7 +170,7 @@ def test_statistics_are_made_again_where_only_numbers_changed(tmp_path, remote):
     before = quantiles()
     shard = folder / "cmu_stretch-train.tfrecord-00000-of-00001"
     records = TFRecordFile(str(shard))
-    examples = [tf_example_pb2.Example.FromString(records.read(number)) for number in range(len(records))]
+    examples = [tf_example_pb2.Example.FromString(records.read(number)) for number in range(len(records))]  # pyright: ignore[reportAttributeAccessIssue]
     for example in examples:
         state = example.features.feature["steps/observation/state"].float_list.value
         state[:] = [2 * number for number in state]

@@ -14,7 +14,7 @@ import pytest
 
 from configs import get_config
 from dsvla_jax.encoding.displacement import displace
-from dsvla_jax.policy import Policy, load, load_policy_config
+from dsvla_jax.policy import Policy, load_policy, load_policy_config
 from dsvla_jax.types import Camera, Observation, Picture, RobotState
 
 ROOT = Path(__file__).parent.parent
@@ -61,7 +61,7 @@ def test_the_documented_sequence(tmp_path: Path):
     assert losses(folder)[4] == pytest.approx(whole[4], rel=1e-5)
 
     # The scale is in the policy and in every checkpoint, and the policy needs no dataset's name to use it.
-    policy, scale = load(folder), load_policy_config(folder).displacement
+    policy, scale = load_policy(folder), load_policy_config(folder).displacement
     assert scale is not None
     saved = json.loads((folder / "checkpoints" / "4" / "iterator" / "metadata").read_text())
     assert saved["scale"] == {"low": list(scale.low), "high": list(scale.high)}

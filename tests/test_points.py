@@ -6,15 +6,8 @@ import numpy as np
 import pytest
 
 from dsvla_jax.encoding.alignment import align_to_patches
-from dsvla_jax.encoding.encode import (
-    CLIP_MEAN,
-    CLIP_STD,
-    EncodingConfig,
-    build_prompt,
-    encode_text,
-    model_inputs,
-    normalize_image,
-)
+from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.encode import CLIP_MEAN, CLIP_STD, build_prompt, encode_text, model_inputs, normalize_image
 from dsvla_jax.encoding.farthest_point import farthest_point_sample
 from dsvla_jax.encoding.neighbours import k_nearest_neighbours
 from dsvla_jax.encoding.point_cloud import cloud_from_depth

@@ -22,7 +22,7 @@ from dsvla_jax.policy import (
     Policy,
     PolicyConfig,
     full_size,
-    load,
+    load_policy,
     load_policy_config,
     load_vocabulary,
     save_policy_config,
@@ -96,7 +96,7 @@ def test_a_run_folder_with_another_vocabulary_is_refused(tmp_path, change):
     config, words = words_run(tmp_path, padding=9)
     save_tokenizer(WordTokenizer(change(words)), tmp_path)
     with pytest.raises(CheckpointError, match="its tokenizer files are not those that it was trained with"):
-        load(tmp_path)
+        load_policy(tmp_path)
     # A run from before the digest was written has its size alone to compare.
     older = dataclasses.replace(config, vocabulary=None)
     if len(change(words)) > len(words):
@@ -113,7 +113,7 @@ def test_a_run_folder_keeps_the_tokenizer(policy, tmp_path):
     checkpoints.save(1, variables_only(policy.variables), NO_NOTES)
     checkpoints.close()
     save_policy_config(tmp_path, policy.config, policy.tokenizer)
-    again = load(tmp_path)
+    again = load_policy(tmp_path)
     assert again.tokenizer == policy.tokenizer
     assert again.act(*batch(8))[1] == policy.act(*batch(8))[1]
 
@@ -125,7 +125,7 @@ def test_a_run_trained_on_eight_devices_loads_on_one(tmp_path):
     command = [sys.executable, "-m", "tests.run_folders", str(tmp_path)]
     subprocess.run(command, cwd=root, env={**os.environ, **devices}, check=True, timeout=300)
     write_run(tmp_path / "one", MODEL)
-    expected = load(tmp_path / "one").variables
+    expected = load_policy(tmp_path / "one").variables
     for name in MESHES:
         assert (tmp_path / name / "base").exists()
-        jax.tree.map(np.testing.assert_array_equal, load(tmp_path / name).variables, expected)
+        jax.tree.map(np.testing.assert_array_equal, load_policy(tmp_path / name).variables, expected)

@@ -38,7 +38,7 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (["train.py", "tiny", "--data.crop", "1.5"], "error: data.crop: expected more than 0, at most 1, got 1.5"),
         (["train.py", "tiny_oxe", "--oxe.horizon", "-1"], "error: oxe.horizon: expected at least 0, got -1.0"),
         (["eval.py", "nowhere"], "no run here"),
-        (["eval.py", "nowhere", "--compare", "elsewhere"], "no results here; evaluate first"),
+        (["eval.py", "nowhere", "--compare", "elsewhere"], "no results under these conditions; evaluate first"),
         (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
         (["train.py", "tiny", "--run", "runs/lr=[0.1]"], "whose path contains [; choose another folder"),
         (["train.py", "tiny", "--run", "/dev/null/run"], "error: /dev/null/run: Not a directory; choose another path"),

@@ -4,7 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, encode_text
+from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.encode import build_prompt, encode_text
 from dsvla_jax.encoding.prompt_table import instruction_tokens, make_prompt_table, write_prompts
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.types import RobotState

@@ -203,7 +203,8 @@ def test_a_checkpoint_of_adapters_alone_is_small(paper):
 
 def test_the_frozen_base_is_kept_in_the_dtype_that_it_is_used_in(paper):
     _, frozen = paper
-    wide = {path[-1] for path, leaf in traverse_util.flatten_dict(frozen).items() if leaf.dtype != "bfloat16"}
+    flat: Any = traverse_util.flatten_dict(frozen)
+    wide = {path[-1] for path, leaf in flat.items() if leaf.dtype != "bfloat16"}
     assert wide == {"scale", "bias", "class_embedding", "positional_embedding"}
 
 

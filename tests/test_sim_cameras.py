@@ -94,10 +94,10 @@ def test_the_front_camera_is_that_of_the_observation():
     env, state = environment(TASKS[0]), somewhere(TASKS[0])
     views, observation = env.observe_cameras(state), env.observe(state)
     front = views.names.index("front")
-    np.testing.assert_array_equal(views.intrinsics[:, front], observation.camera.intrinsics)
-    np.testing.assert_array_equal(views.world_from_camera[:, front], observation.camera.world_from_camera)
-    np.testing.assert_allclose(views.depth[:, front], observation.depth, atol=1e-5)
-    assert np.mean(np.asarray(views.rgb[:, front]) != np.asarray(observation.rgb)) < 1e-3
+    np.testing.assert_array_equal(views.intrinsics[:, front], observation.picture.camera.intrinsics)
+    np.testing.assert_array_equal(views.world_from_camera[:, front], observation.picture.camera.world_from_camera)
+    np.testing.assert_allclose(views.depth[:, front], observation.picture.depth, atol=1e-5)
+    assert np.mean(np.asarray(views.rgb[:, front]) != np.asarray(observation.picture.rgb)) < 1e-3
 
 
 def test_fixed_cameras_have_rlbenchs_poses_and_look_at_the_table():

@@ -236,8 +236,8 @@ def test_the_compiled_environment_is_the_pure_functions():
     pure = environment.step(env.scene, env.physics, started, action)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), pure, compiled)
     seen, expected = environment.observe(env.scene, env.renderer, pure), env.observe(compiled)
-    np.testing.assert_allclose(seen.pose, expected.pose, atol=1e-5)
-    assert np.mean(np.asarray(seen.rgb) != np.asarray(expected.rgb)) < 1e-2
+    np.testing.assert_allclose(seen.robot.pose, expected.robot.pose, atol=1e-5)
+    assert np.mean(np.asarray(seen.picture.rgb) != np.asarray(expected.picture.rgb)) < 1e-2
 
 
 def _carry(env: Environment, state):
@@ -358,7 +358,8 @@ def _passing_low(state: physics.SimState) -> physics.Verdict:
 
 def test_both_engines_agree_and_keep_episodes_apart():
     c_state = _tiny_run(MujocoPhysics(_tiny_model(), _passing_low))
-    mjx_state = _tiny_run(physics.jit_with_mjx(mjx_physics(_tiny_model(), _passing_low)))
+    engine = mjx_physics(_tiny_model(), _passing_low)
+    mjx_state = _tiny_run(physics.jit_with_mjx(lambda *arguments: engine(*arguments)))
     good = np.array([0, 2, 3])
     for state in (c_state, mjx_state):
         np.testing.assert_array_equal(state.diverged, [False, True, False, False])

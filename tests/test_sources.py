@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,7 +17,7 @@ from data_pipelines.samples import make_sampler
 from data_pipelines.sources import choose_tasks, open_demonstrations
 from data_pipelines.vocabulary import write_vocabulary
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.errors import UserError
@@ -74,7 +75,7 @@ def test_unknown_words_need_a_vocabulary(tmp_path, capsys):
     with pytest.raises(UserError, match=r"no token for 'mug', 'rinse', 'times'; write one with .*vocabulary"):
         open_demonstrations(data, suite_tokenizer())
     write_vocabulary(tmp_path / "words", EpisodeReader(tmp_path / "out").instructions)
-    tokenizer = load_tokenizer(tmp_path / "words")
+    tokenizer: Any = load_tokenizer(tmp_path / "words")
     assert f"--model.language.vocab-size {tokenizer.vocab_size}" in capsys.readouterr().out
     open_demonstrations(data, tokenizer)
     assert set(suite_tokenizer().words) < set(tokenizer.words)

@@ -94,6 +94,7 @@ def test_few_steps_have_a_schedule(steps):
     optimizer = make_optimizer(OptimizerConfig(), steps)
     weight = jnp.ones((2, 2))
     state = optimizer.init(weight)
+    update = weight
     for _ in range(steps):
         update, state = optimizer.update(jnp.ones((2, 2)), state, weight)
     assert np.all(np.asarray(update) < 0)

@@ -28,7 +28,7 @@ from data_pipelines.rlds.tfrecord import write_records
 from data_pipelines.rlds.writing import encode_image
 from data_pipelines.workspace import View, count_points, fit_box, require_points
 from dsvla_jax.data_config import DataConfig, OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.config import ModelConfig
@@ -171,7 +171,7 @@ def test_depth_without_readings_or_in_other_units_stops_or_is_left_out(tmp_path,
     shard = build.shards("train")[0]
     opened = build.open_shard(shard)
     records = [opened.read(number) for number in range(len(opened))]
-    example = tf_example_pb2.Example.FromString(records[1])
+    example = tf_example_pb2.Example.FromString(records[1])  # pyright: ignore[reportAttributeAccessIssue]
     picture = encode_image(np.full((256, 256, 1), counts, np.uint16), ".png").getvalue()
     example.features.feature["steps/observation/depth"].bytes_list.value[2] = picture
     write_records(Path(shard.path), [records[0], example.SerializeToString(), *records[2:]])

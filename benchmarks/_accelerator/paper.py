@@ -20,7 +20,7 @@ from configs import get_config
 from data_pipelines.records import Frame
 from data_pipelines.samples import make_sampler
 from dsvla_jax.data_config import DataConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import Tokenizer

@@ -16,7 +16,7 @@ from data_pipelines.inspect.episodes import describe_episodes
 from data_pipelines.inspect.page import Page, print_page, write_page
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.prompts import Style
 from dsvla_jax.errors import DataError
 from dsvla_jax.ranges import FINITE, at_least, check_fields

@@ -11,7 +11,8 @@ from data_pipelines.first_look import cloud_warnings, frames_of, say_components,
 from data_pipelines.inspect.drawing import camera_of, draw_clouds, draw_frame, frame_cloud
 from data_pipelines.inspect.page import Page, Section, Table
 from data_pipelines.records import Episode, Frame, decode_frame
-from dsvla_jax.encoding.encode import EncodingConfig, build_prompt
+from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.encode import build_prompt
 from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.evaluation.pictures import film_strip

@@ -27,8 +27,8 @@ from data_pipelines.rlds import files
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.workspace import require_points
 from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import displace
-from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.evaluation.pictures import MAX_STRIP_FRAMES, film_strip
 from dsvla_jax.types import Action, Picture, RobotState

@@ -6,7 +6,7 @@ import operator
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any, SupportsIndex
+from typing import Any, SupportsIndex, cast
 
 import grain
 import numpy as np
@@ -15,8 +15,8 @@ from data_pipelines.oxe.mixture import ENDLESS, EncodedSample, MixtureSource
 from data_pipelines.oxe.samples import make_batcher
 from data_pipelines.oxe.scale import MixtureScale
 from dsvla_jax.data_config import OxeConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import DisplacementScale
-from dsvla_jax.encoding.encode import EncodingConfig
 from dsvla_jax.encoding.text import Tokenizer, check_words
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.json_values import Json
@@ -67,7 +67,7 @@ class OxeLoader(Iterator[Example[np.ndarray]]):
         batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
         options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=ahead)
         dataset = batches.map(to_batch).to_iter_dataset(options)
-        self._batches: grain.DatasetIterator[Example[np.ndarray]] = iter(dataset)
+        self._batches = cast(grain.DatasetIterator[Example[np.ndarray]], iter(dataset))
 
     @property
     def num_samples(self) -> int:

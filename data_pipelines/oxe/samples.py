@@ -15,7 +15,8 @@ from data_pipelines.oxe.scale import MixtureScale
 from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box, vary_light
 from data_pipelines.rlds.features import decode_image
 from dsvla_jax.data_config import OxeConfig
-from dsvla_jax.encoding.encode import EncodingConfig, encode_text
+from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.encode import encode_text
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer

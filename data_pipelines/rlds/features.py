@@ -13,7 +13,7 @@ from typing import Any, cast
 import cv2
 import numpy as np
 from google.protobuf.json_format import ParseError
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 from tensorflow_datasets.core.features import (
     Dataset,
     FeatureConnector,
@@ -22,7 +22,7 @@ from tensorflow_datasets.core.features import (
     Tensor,
 )
 from tensorflow_datasets.core.features.tensor_feature import Encoding
-from tensorflow_datasets.proto import tf_example_pb2, tf_feature_pb2
+from tensorflow_datasets.proto import tf_example_pb2
 
 from dsvla_jax.errors import DataError
 from dsvla_jax.json_values import Json
@@ -60,7 +60,7 @@ class RldsEpisode:
         self.where = where
         self._features = features
         try:
-            example = tf_example_pb2.Example.FromString(record)
+            example = tf_example_pb2.Example.FromString(record)  # pyright: ignore[reportAttributeAccessIssue]
         except DecodeError as error:
             raise DataError(where, "record", "a tf.train.Example", str(error), _FIX) from error
         self._values = example.features.feature
@@ -248,7 +248,7 @@ def _is_simple(feature: FeatureConnector) -> bool:
     return isinstance(feature, Image) or shape_of(feature).count(None) <= (1 if _is_bytes(feature) else 0)
 
 
-def _list_of(values: tf_feature_pb2.Feature) -> Sequence[bytes | int | float] | None:
+def _list_of(values: Message) -> Sequence[bytes | int | float] | None:
     kind = values.WhichOneof("kind")
     return None if kind is None else getattr(values, kind).value
 

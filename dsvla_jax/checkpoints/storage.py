@@ -1,7 +1,7 @@
 """What orbax and TensorStore ask of a path and of a tree, and the error that says what is wrong with a checkpoint."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import orbax.checkpoint as ocp
@@ -39,8 +39,7 @@ def require_index(item: Path) -> None:
 
 def require_same_shapes(stored: PyTree, expected: PyTree, where: Path) -> None:
     """Raises CheckpointError naming the first parameters that a checkpoint lacks, or holds in another shape."""
-    found = {"/".join(map(str, path)): leaf.shape for path, leaf in traverse_util.flatten_dict(tree_of(stored)).items()}
-    wanted = {"/".join(map(str, path)): leaf.shape for path, leaf in traverse_util.flatten_dict(expected).items()}
+    found, wanted = _shapes(tree_of(stored)), _shapes(expected)
     problems = [
         f"{name}: expected {wanted.get(name, 'nothing')}, found {found.get(name, 'nothing')}"
         for name in sorted(wanted.keys() | found.keys())
@@ -52,6 +51,11 @@ def require_same_shapes(stored: PyTree, expected: PyTree, where: Path) -> None:
             f"{where}: this checkpoint is of another model: {'; '.join(problems[:3])}{more}. "
             "Use the config that the run was trained with, or another --run folder"
         )
+
+
+def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
+    flat = cast(dict[tuple[str, ...], jax.Array], traverse_util.flatten_dict(tree))
+    return {"/".join(map(str, path)): leaf.shape for path, leaf in flat.items()}
 
 
 def tree_of(metadata: PyTree) -> PyTree:
@@ -66,7 +70,8 @@ def abstract(tree: PyTree) -> PyTree:
 
     def struct_of(leaf: PyTree) -> PyTree:
         struct = ocp.utils.to_shape_dtype_struct(leaf)
-        lacks_sharding = isinstance(struct, jax.ShapeDtypeStruct) and struct.sharding is None
-        return struct.update(sharding=here) if lacks_sharding else struct
+        if isinstance(struct, jax.ShapeDtypeStruct) and struct.sharding is None:
+            return struct.update(sharding=here)
+        return struct
 
     return jax.tree.map(struct_of, tree)

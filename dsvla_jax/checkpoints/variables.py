@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import cast
 
 import jax
 import numpy as np
@@ -41,5 +42,5 @@ def stored_variables(items: Iterable[tuple[Path, PyTree]]) -> dict[tuple[str, ..
     return {
         path: StoredVariable(folder, path, tuple(leaf.shape))
         for folder, metadata in items
-        for path, leaf in traverse_util.flatten_dict(tree_of(metadata)).items()
+        for path, leaf in cast(dict[tuple[str, ...], jax.Array], traverse_util.flatten_dict(tree_of(metadata))).items()
     }

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from dsvla_jax.encoding.codec import VALUES_PER_ARM
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.prompts import format_prompt
 from dsvla_jax.encoding.text import HIGHEST_NUMBER, LOWEST_NUMBER, Tokenizer
 from dsvla_jax.errors import UserError

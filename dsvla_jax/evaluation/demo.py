@@ -15,7 +15,8 @@ import tyro
 
 import dsvla_jax.policy
 from dsvla_jax.command_line import configure_jax, fail_with_message, parse_options
-from dsvla_jax.encoding.encode import EncodingConfig, build_prompt, cloud_tokens
+from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.encode import build_prompt, cloud_tokens
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.loop import run_episodes

@@ -3,6 +3,7 @@
 Touvron et al. 2023; parameter layout and rotation as in Hugging Face's Llama.
 """
 
+import dataclasses
 from typing import Any
 
 import flax.linen as nn
@@ -162,7 +163,7 @@ class DecoderBlock(nn.Module):
                 split_heads(project(tokens, adapted=False), language.kv_heads) for project in (to_key, to_value)
             )
             prompt = PromptCache(prompt_key, prompt_value, prompt.gate)
-            cache = None if cache is None else cache.replace(prompt=prompt)
+            cache = None if cache is None else dataclasses.replace(cache, prompt=prompt)
         if isinstance(prompt, PromptCache):
             gate = jnp.tanh(prompt.gate)[:, None, None].astype(dtype)
             attended += gate * attend(query, prompt.keys, prompt.values, implementation=self.config.attention)
@@ -233,7 +234,7 @@ class Llama(nn.Module):
         else:
             # The prompt goes beside the cache and not in it, so that the loop over layers does not write it anew.
             cached = cache.prompt
-            x, text = self.layers(x, tables, mask, cache.replace(prompt=None), index, None, cached)
+            x, text = self.layers(x, tables, mask, dataclasses.replace(cache, prompt=None), index, None, cached)
             cache = KVCache(text.keys, text.values, cached)
         return self.norm(x[:, first_row:]).astype(self.config.compute_dtype), cache
 

@@ -1,6 +1,6 @@
 """The sizes that an encoding and a model must share: each stands in both configs."""
 
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import ModelConfig
 

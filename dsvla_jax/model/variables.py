@@ -1,7 +1,8 @@
 """Which of a model's variables learn and which are frozen, as operations on nested dicts."""
 
-from typing import Any, Literal, TypeAlias, assert_never
+from typing import Any, Literal, TypeAlias, assert_never, cast
 
+import jax
 import jax.numpy as jnp
 from flax import traverse_util
 
@@ -42,7 +43,7 @@ def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Va
 
 def narrow_frozen(frozen: Variables, dtype: jnp.dtype) -> Variables:
     """The frozen variables with those that the model only ever reads in ``dtype`` kept in it: no result changes."""
-    flat = traverse_util.flatten_dict(frozen)
+    flat = cast(dict[tuple[str, ...], jax.Array], traverse_util.flatten_dict(frozen))
     narrow = {
         path: leaf.astype(dtype) if path[-1] in MATRICES and leaf.dtype != jnp.int8 else leaf
         for path, leaf in flat.items()

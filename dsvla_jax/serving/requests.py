@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dsvla_jax.encoding.codec import PoseCodec
-from dsvla_jax.encoding.encode import EncodingConfig
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.observation_checks import (
     check_camera,

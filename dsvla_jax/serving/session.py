@@ -37,8 +37,8 @@ class Session:
             raise ValueError("Session.look: made without a tracker")
         if request.reset or self._progress is None or request.instruction != self._progress.instruction:
             self._tracker.reset()
-        seen = request.observation
-        return self._tracker.keypoints(np.asarray(seen.rgb), np.asarray(seen.depth), seen.camera, arms)
+        seen = request.observation.picture
+        return self._tracker.keypoints(seen.rgb, seen.depth, seen.camera, arms)
 
     def begins(self, request: Request, keypoints: np.ndarray) -> bool:
         """Whether an episode begins with this request and its keypoints (A, K, 3)."""

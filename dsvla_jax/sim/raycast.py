@@ -59,7 +59,7 @@ class Geom(NamedTuple):
     position: Array
     rotation: Array
     size: Array
-    index: Array
+    number: Array
     shown: Array
 
 
@@ -262,7 +262,7 @@ def _cast(primitives: Primitives, poses: Poses, eye: Array, d: Vector, shadows: 
         origin = _into(geom.rotation, Vector(*(eye - geom.position)))
         enter, leave = interval(origin, _into(geom.rotation, d), geom.size)
         closer = (enter <= leave) & (enter > NEAR) & (enter < best) & geom.shown
-        return jnp.where(closer, enter, best), jnp.where(closer, geom.index, winner)
+        return jnp.where(closer, enter, best), jnp.where(closer, geom.number, winner)
 
     start = (jnp.full_like(d.x, jnp.inf), jnp.full(d.x.shape, -1, jnp.int32))
     t, winner = _scan_geoms(primitives, poses, start, nearest)

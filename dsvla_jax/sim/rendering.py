@@ -1,5 +1,6 @@
 """Pictures of many episodes at a time: what the cameras of an environment see of its states."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -69,7 +70,7 @@ def _render(renderer: Renderer, state: SimState, camera: Camera, own_camera: boo
     ) -> Rendering:
         return Rendering(
             *raycast.render(
-                primitives.replace(sizes=geom_size, light_direction=light),
+                dataclasses.replace(primitives, sizes=geom_size, light_direction=light),
                 geom_xpos,
                 geom_xmat,
                 geom_rgba,

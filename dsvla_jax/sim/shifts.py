@@ -8,8 +8,8 @@
 Each is a pure function (scene, key, start of one episode) -> start; vmap them over episodes.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ def other_instance(scene: Scene, key: Array, start: Start) -> Start:
         # It stays on what it stands on.
         height = scene.layout.free_address(name) + 2
         qpos = qpos.at[height].add((factor[2] - 1) * _reach_down(model, geoms))
-    return start.replace(scene=start.scene.replace(geom_rgba=rgba, qpos=qpos), geom_size=size, geom_pos=position)
+    return replace(start, scene=replace(start.scene, geom_rgba=rgba, qpos=qpos), geom_size=size, geom_pos=position)
 
 
 def other_position(scene: Scene, key: Array, start: Start) -> Start:
@@ -111,7 +111,7 @@ def other_position(scene: Scene, key: Array, start: Start) -> Start:
         else:
             address = layout.free_address(name)
             qpos = qpos.at[address : address + 2].add(offset)
-    return start.replace(scene=start.scene.replace(qpos=qpos, mocap_pos=places))
+    return replace(start, scene=replace(start.scene, qpos=qpos, mocap_pos=places))
 
 
 def other_background(scene: Scene, key: Array, start: Start) -> Start:
@@ -132,8 +132,8 @@ def other_background(scene: Scene, key: Array, start: Start) -> Start:
         places = places.at[scene.layout.mocap[name]].set(jnp.stack([x, y, jnp.float32(TABLE_HEIGHT + height)]))
         rgba = rgba.at[geom, :3].set(colours[number])
     light = start.light.at[:2].set(jax.random.uniform(light_key, (2,), minval=-LIGHT, maxval=LIGHT))
-    return start.replace(
-        scene=start.scene.replace(geom_rgba=rgba, mocap_pos=places), light=light / jnp.linalg.norm(light)
+    return replace(
+        start, scene=replace(start.scene, geom_rgba=rgba, mocap_pos=places), light=light / jnp.linalg.norm(light)
     )
 
 
@@ -147,7 +147,7 @@ def other_view(scene: Scene, key: Array, start: Start) -> Start:
     turn = tilt @ orbit
     position = MIDDLE + (1 + far * DISTANCE) * (turn @ (pose[:3, 3] - MIDDLE))
     moved = pose.at[:3, :3].set(turn @ pose[:3, :3]).at[:3, 3].set(position)
-    return start.replace(camera=dataclasses.replace(start.camera, world_from_camera=moved))
+    return replace(start, camera=replace(start.camera, world_from_camera=moved))
 
 
 _FUNCTIONS: dict[str, Callable[[Scene, Array, Start], Start]] = {

@@ -129,9 +129,11 @@ class Watchdog:
             # The runtime's own errors start with a status. A collective broke, most likely because another process did:
             # say which, once its silence shows.
             deadline = time.monotonic() + self._silence + 2 * self._interval
-            while time.monotonic() < deadline and not (problem := self._problem()):
+            problem = self._problem()
+            while time.monotonic() < deadline and not problem:
                 time.sleep(self._interval / 5)
                 self._write()
+                problem = self._problem()
             if problem:
                 self._end(problem)
         if isinstance(error, UserError):

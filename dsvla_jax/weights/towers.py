@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from types import EllipsisType
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -227,7 +227,8 @@ def tower_shapes(config: LanguageConfig | VisionConfig) -> dict[str, tuple[int, 
 
 def flat_shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
     """The shapes of a nested dict's leaves by path."""
-    return {path: leaf.shape for path, leaf in traverse_util.flatten_dict(tree, sep="/").items()}
+    flat = cast(dict[str, jax.Array], traverse_util.flatten_dict(tree, sep="/"))
+    return {path: leaf.shape for path, leaf in flat.items()}
 
 
 def summarize(keys: Iterable[str]) -> str:

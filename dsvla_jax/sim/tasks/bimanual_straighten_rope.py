@@ -35,10 +35,9 @@ def _build(spec: mujoco.MjSpec) -> None:
 
     red, tip = [0.8, 0.1, 0.1, 1], [0.5, 0.05, 0.08, 1]
     names = [ENDS[0], *(f"rope_{i}" for i in range(1, LINKS - 1)), ENDS[1]]
+    link = task.add_object(spec, names[0], RADIUS)
     for i, name in enumerate(names):
-        if i == 0:
-            link = task.add_object(spec, name, RADIUS)
-        else:
+        if i > 0:
             link = link.add_body(name=name, pos=[LENGTH, 0, 0])
             upright = {"type": task.HINGE, "axis": [0, 0, 1], "range": [-1.5, 1.5], "limited": True}
             joint = link.add_joint(name=f"rope_joint{i}", **upright)
