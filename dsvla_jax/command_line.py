@@ -133,7 +133,7 @@ def require_usual_draws() -> None:
 
 def _require_platform() -> None:
     """Raises UserError where the user asked for devices that this machine or this installation lacks."""
-    asked = jax.config.read("jax_platforms")
+    asked = jax.config.jax_platforms  # pyright: ignore[reportAttributeAccessIssue]
     if not asked:
         return
     try:
@@ -157,7 +157,8 @@ def configure_jax(physics: str = "mujoco") -> None:
         # Among several threads, XLA's CPU client of jax 0.10 loses large programs of MJX (stack_blocks'), which then
         # never end. It reads this when it starts; MJX's arrays are too small to gain from threads.
         os.environ.setdefault("NPROC", "1")
-    if jax.config.read("jax_compilation_cache_dir") is None:
+    cached = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if cached is None:
         folder = cache_folder()
         if folder is not None:
             jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
