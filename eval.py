@@ -182,10 +182,16 @@ def compared(run: Path, options: Options) -> list[EpisodeResult]:
         "shifts": check_shifts(options.shift),
         "seed": options.seed,
         "choice": options.choice,
-        **({"keypoints": options.keypoints} if options.keypoints else {}),
         **({"step": options.step} if isinstance(options.step, int) else {}),
     }
-    results = latest(read_results(folder), lambda found: wanted.items() <= vars(found).items())
+    config, keypoints = run / "config.json", options.keypoints
+    if keypoints is None and config.exists():
+        keypoints = load_experiment(config).keypoints
+
+    def matches(found: Conditions) -> bool:
+        return wanted.items() <= vars(found).items() and (keypoints is None or found.keypoints in ("", keypoints))
+
+    results = latest(read_results(folder), matches)
     if not results:
         raise UserError(f"{folder}: no results under these conditions; evaluate first: python eval.py {run}")
     return results

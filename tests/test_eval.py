@@ -130,6 +130,17 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_an_episode_is_run(
     assert "keyframe" not in capsys.readouterr().err
 
 
+def test_runs_are_compared_under_the_keypoints_that_they_learned_with(tmp_path: Path, capsys):
+    run = write_run(tmp_path / "run")
+    plain, found = Conditions(keypoints="oracle"), Conditions(keypoints="segmentation")
+    results = [dataclasses.replace(OLD[0], conditions=one, success=one == plain) for one in (plain, found)]
+    write_results(run / "eval", results)
+    program.main(program.Options(run, compare=(run,)))
+    assert "100.0" in capsys.readouterr().out
+    program.main(program.Options(run, compare=(run,), keypoints="segmentation"))
+    assert "100.0" not in capsys.readouterr().out
+
+
 def test_results_written_elsewhere_are_compared(tmp_path: Path, capsys):
     write_results(tmp_path / "elsewhere", OLD[:1])
     write_results(tmp_path / "other" / "eval", OLD[2:3])
