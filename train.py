@@ -8,11 +8,10 @@ command is given again; a finished one is left as it is.
 
 import contextlib
 import dataclasses
-import itertools
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,51 +19,42 @@ import jax
 import numpy as np
 import tyro
 
-import dsvla_jax.policy
 from configs import config_names, get_config
-from data_pipelines.first_look import fit_workspace, look_at_demonstrations, look_at_mixture
-from data_pipelines.learned_from import learned_from, learned_from_oxe
-from data_pipelines.loader import make_loader
-from data_pipelines.samples import make_sampler, make_validation_sampler
 from data_pipelines.sources import (
     choose_tasks,
-    open_demonstrations,
-    open_held_out,
     require_data_fits,
     require_oxe_fits,
 )
+from data_pipelines.training_data import open_training_data, open_validation_data, with_workspace
 from dsvla_jax.checkpoints.run import RunCheckpoints
-from dsvla_jax.checkpoints.steps import has_checkpoints
-from dsvla_jax.checkpoints.storage import require_same_shapes, require_writable_path
+from dsvla_jax.checkpoints.storage import require_writable_path
 from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory, parse_options
-from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.number_targets import number_rows
-from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer
-from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.loop import Stopped, on_host, run_task
-from dsvla_jax.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
+from dsvla_jax.evaluation.while_training import measure_success
+from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.partition import make_sharded
-from dsvla_jax.model.variables import Variables, join_variables
-from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.perception.simulator import keypoint_source
+from dsvla_jax.model.variables import join_variables
+from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.preflight import check_step
 from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
 from dsvla_jax.ranges import require
 from dsvla_jax.sim.environment import Environment
-from dsvla_jax.sim.tasks import TASKS, select_tasks
-from dsvla_jax.suite_vocabulary import suite_tokenizer
+from dsvla_jax.sim.tasks import TASKS
+from dsvla_jax.suite_vocabulary import tokenizer_of
 from dsvla_jax.training import loop
-from dsvla_jax.training.distributed import Watchdog, first_process_first, start_processes
+from dsvla_jax.training.distributed import Watchdog, start_processes
 from dsvla_jax.training.metrics import MetricsWriter, require_wandb
+from dsvla_jax.training.possible import require_possible
 from dsvla_jax.training.profile import trace_steps
 from dsvla_jax.training.run_folder import only_one_process, remove_other_start, require_same_experiment, run_folder
 from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_batch
 from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
-from dsvla_jax.types import Example, HeldOutExample
-from dsvla_jax.weights.backbones import is_imported, load_for_model, require_base
+from dsvla_jax.types import Example
+from dsvla_jax.weights.backbones import require_base
+from dsvla_jax.weights.base_variables import base_variables
 
 
 def prepare(
@@ -77,7 +67,7 @@ def prepare(
     or what the run folder holds.
     """
     require_writable_path(run)
-    tokenizer = tokenizer_of(experiment)
+    tokenizer = tokenizer_of(experiment.tokenizer, experiment.model.language.vocab_size)
     if experiment.oxe is None:
         tasks = choose_tasks(experiment.data)
         experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
@@ -143,24 +133,22 @@ def train(
     profile: int,
 ) -> signal.Signals | None:
     """Trains from the newest checkpoint, or from the beginning. Returns the signal that stopped it, if one did."""
-    batches, samples, displacement = open_data(experiment, tokenizer, part)
-    held_out = open_validation(experiment, tokenizer, part)
+    data = open_training_data(experiment, tokenizer, part)
+    held_out = open_validation_data(experiment, tokenizer, part)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
-    state, frozen = make_sharded(start, mesh, base_variables(experiment, mesh))
-    report_size(state.trainable, frozen, samples)
+    base = base_variables(experiment.base, experiment.model, tokenizer, experiment.regime != "full", mesh)
+    state, frozen = make_sharded(start, mesh, base)
+    report_size(state.trainable, frozen, data.samples)
 
     save_experiment(run / "config.json", experiment)
-    if experiment.oxe is None:
-        learned = learned_from(experiment.data, experiment.encoding.use_keypoints)
-    else:
-        learned = learned_from_oxe(experiment.oxe, [len(item.dataset.arms) for item in batches.source.datasets])
-    save_policy_config(run, PolicyConfig(experiment.encoding, experiment.model, displacement, learned), tokenizer)
+    config = PolicyConfig(experiment.encoding, experiment.model, data.displacement, data.learned_from)
+    save_policy_config(run, config, tokenizer)
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
         restored = checkpoints.restore(loop.arrays_of(state))
         state = loop.state_of(restored)
-        batches.set_state(restored.notes.iterator)
+        data.batches.set_state(restored.notes.iterator)
         print(f"resuming {run} at step {restored.step}")
     else:
         checkpoints.save_base(frozen)
@@ -176,9 +164,18 @@ def train(
     def validate(state: TrainState, _: Callable[[], bool]) -> dict[str, float]:
         return mean_errors(sums, state.trainable, frozen, held_out(), mesh)
 
+    @cache
+    def environments() -> dict[str, Environment]:
+        return {name: Environment(name, image_size=experiment.data.image_size) for name in experiment.data.tasks}
+
+    def evaluate(state: TrainState, stop: Callable[[], bool]) -> dict[str, float]:
+        policy = Policy(config, join_variables(state.trainable, frozen), tokenizer)
+        episodes = experiment.evaluation.episodes_while_training
+        return measure_success(policy.act, environments(), experiment.keypoints, episodes, experiment.data.seed, stop)
+
     checks = (
         loop.PeriodicEval("validating", experiment.validate_every, validate),
-        loop.PeriodicEval("evaluating", experiment.evaluate_every, make_evaluation(experiment, tokenizer, frozen)),
+        loop.PeriodicEval("evaluating", experiment.evaluate_every, evaluate),
     )
     with (
         MetricsWriter(run, int(state.step), wandb, dataclasses.asdict(experiment)) as metrics,
@@ -189,161 +186,12 @@ def train(
             run,
             state=state,
             step=traced,
-            batches=batches,
+            batches=data.batches,
             checkpoints=checkpoints,
             metrics=metrics,
             checks=checks,
             note=watchdog.doing,
         )
-
-
-def open_data(
-    experiment: Experiment, tokenizer: Tokenizer, part: BatchPart
-) -> tuple[Any, int, DisplacementScale | None]:
-    """The batches of this process, as an iterator with a position to save; the number of different samples; and what
-    displacements are binned over, where the targets are such.
-    """
-    order: dict[str, Any] = {
-        "batch_size": part.size,
-        "seed": experiment.seed,
-        "process_index": part.index,
-        "process_count": part.count,
-    }
-    if experiment.oxe is not None:
-        # Its feature definitions take a second to import, which no other run needs.
-        from data_pipelines.oxe.loader import OxeLoader
-
-        loader = OxeLoader(experiment.oxe, experiment.encoding, tokenizer, **order)
-        print(*look_at_mixture(loader.source.datasets, experiment.encoding), sep="\n")
-        return loader, loader.num_samples, loader.scale
-    with first_process_first("demonstrations"):
-        reader = open_demonstrations(experiment.data, tokenizer)
-    print(look_at_demonstrations(reader, experiment.encoding))
-    sample = make_sampler(experiment.data, experiment.encoding, tokenizer)
-    return make_loader(reader, sample, **order), reader.num_frames, None
-
-
-def open_validation(
-    experiment: Experiment, tokenizer: Tokenizer, part: BatchPart
-) -> Callable[[], Iterator[HeldOutExample[np.ndarray]]]:
-    """This process's parts of the batches to validate with, from their beginning each time: never training's stream.
-    None where nothing is validated."""
-    if not experiment.validate_every:
-        return lambda: iter(())
-    with first_process_first("held-out demonstrations"):
-        reader = open_held_out(experiment.data, tokenizer, experiment.validation.episodes)
-    sample = make_validation_sampler(experiment.data, experiment.encoding, tokenizer)
-    # A pass forward over the part of a batch that is trained on at a time fits where training does.
-    size = part.size // experiment.gradient_accumulation
-    count = min(experiment.validation.batches, max(reader.num_frames // (size * part.count), 1))
-    order: dict[str, Any] = {"seed": experiment.seed, "process_index": part.index, "process_count": part.count}
-
-    def batches() -> Iterator[HeldOutExample[np.ndarray]]:
-        return itertools.islice(make_loader(reader, sample, batch_size=size, num_threads=0, **order), count)
-
-    return batches
-
-
-def make_evaluation(
-    experiment: Experiment, tokenizer: Tokenizer, frozen: Variables
-) -> Callable[[TrainState, Callable[[], bool]], dict[str, float]]:
-    """Success rates of the present weights on the training tasks, from seeds that neither training nor eval.py has."""
-    environments: dict[str, Environment] = {}
-
-    def evaluate(state: TrainState, stop: Callable[[], bool]) -> dict[str, float]:
-        config = PolicyConfig(experiment.encoding, experiment.model)
-        policy = Policy(config, join_variables(state.trainable, frozen), tokenizer)
-        rates: dict[str, float] = {}
-        for name in experiment.data.tasks:
-            if name not in environments:
-                environments[name] = Environment(name, image_size=experiment.data.image_size)
-            try:
-                endings = run_task(
-                    environments[name],
-                    on_host(environments[name], policy.act),
-                    experiment.evaluation.episodes_while_training,
-                    split="validation",
-                    seed=experiment.data.seed,
-                    find_keypoints=keypoint_source(experiment.keypoints, environments[name]),
-                    stop=stop,
-                )
-            except Stopped:
-                return {}
-            rates[f"evaluation/{name}"] = float(np.mean([ending.success for ending in endings]))
-        return {**rates, "evaluation/success": float(np.mean(list(rates.values())))}
-
-    return evaluate
-
-
-def require_possible(experiment: Experiment) -> None:
-    """Raises UserError where training cannot be scheduled or watched as asked for."""
-    warmup = experiment.optimizer.warmup_steps
-    # The default suits every run, because warm-up is a fifth of it at most.
-    if warmup > experiment.steps and warmup != OptimizerConfig().warmup_steps:
-        raise UserError(f"optimizer.warmup_steps: expected at most steps ({experiment.steps}), got {warmup}")
-    if experiment.evaluate_every:
-        if experiment.oxe is not None:
-            raise UserError("evaluate_every: the simulator has no tasks of Open X-Embodiment; set it to 0")
-        if jax.process_count() > 1:
-            raise UserError(
-                f"evaluate_every: episodes run in one process, and this job has {jax.process_count()}, none of which "
-                "holds all weights; set it to 0, use --validate-every, and evaluate checkpoints beside the job: python "
-                "eval.py RUN"
-            )
-        select_tasks(experiment.data.tasks)
-        size = experiment.data.image_size
-        experiment.encoding.require_points(size, size, "a picture of data.image_size")
-    if experiment.validate_every and experiment.oxe is not None:
-        raise UserError(
-            "validate_every: nothing is held out of Open X-Embodiment mixtures, whose displacements are binned over "
-            "what training learns from; set it to 0, and judge the run by what is finetuned from it"
-        )
-
-
-def with_workspace(experiment: Experiment, run: Path, tokenizer: Tokenizer) -> Experiment:
-    """The experiment with the workspace that its run or else its data have, where that is to be fitted."""
-    if not (experiment.fit_workspace and experiment.encoding.use_points):
-        return experiment
-    config = run / "config.json"
-    if config.exists() and has_checkpoints(run):
-        known = load_experiment(config).encoding
-        box = {"workspace_low": known.workspace_low, "workspace_high": known.workspace_high}
-        return dataclasses.replace(experiment, encoding=dataclasses.replace(experiment.encoding, **box))
-    with first_process_first("demonstrations"):
-        encoding = fit_workspace(experiment.data, experiment.oxe, experiment.encoding, tokenizer)
-    print(f"workspace fitted: from {encoding.workspace_low} to {encoding.workspace_high}")
-    return dataclasses.replace(experiment, encoding=encoding)
-
-
-def tokenizer_of(experiment: Experiment) -> Tokenizer:
-    """The vocabulary of the experiment, which has to be that of its language model."""
-    tokenizer = load_tokenizer(experiment.tokenizer) if experiment.tokenizer else suite_tokenizer()
-    expected = experiment.model.language.vocab_size
-    if not fits_rows(tokenizer, expected):
-        raise UserError(
-            f"tokenizer: {experiment.tokenizer or 'the words of the task suite'} has {tokenizer.vocab_size} tokens, "
-            f"model.language.vocab_size is {expected}; they must be of one language model"
-        )
-    return tokenizer
-
-
-def base_variables(experiment: Experiment, mesh: jax.sharding.Mesh) -> dict[str, Any]:
-    """The variables that a base run or imported weights have for the experiment, split over the mesh."""
-    if not experiment.base:
-        return {}
-    folder = Path(experiment.base)
-    if is_imported(folder):
-        return load_for_model(folder, experiment.model, mesh, frozen=experiment.regime != "full")
-    policy = dsvla_jax.policy.load_policy(folder, mesh)
-    if policy.tokenizer != tokenizer_of(experiment):
-        raise UserError(
-            f"base: {folder} was trained with another vocabulary, whose tokens its embedding stands for; train with "
-            f"that one: --tokenizer {folder}"
-        )
-    params = policy.variables["params"]
-    expected = jax.eval_shape(lambda: initialize(experiment.model, jax.random.key(0)))
-    require_same_shapes(params, expected["params"], folder)
-    return {"params": params}
 
 
 def report_size(trainable: Any, frozen: Any, samples: int) -> None:

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import train
 from dsvla_jax.checkpoints.storage import CheckpointError
+from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, MeshConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig
@@ -24,6 +24,7 @@ from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.sharding import make_mesh
 from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step, model_inputs
 from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.base_variables import base_variables
 from tests.run_folders import write_run
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
 
@@ -54,7 +55,13 @@ def start(experiment: Experiment):
     def make(base):
         return initial_state(experiment, values, optimizer, base)
 
-    return make_sharded(make, mesh, train.base_variables(experiment, mesh))
+    return make_sharded(make, mesh, base_of(experiment, mesh))
+
+
+def base_of(experiment, mesh):
+    """The variables of its base, with the words of the task suite or of the experiment's tokenizer."""
+    tokenizer = load_tokenizer(experiment.tokenizer) if experiment.tokenizer else suite_tokenizer()
+    return base_variables(experiment.base, experiment.model, tokenizer, experiment.regime != "full", mesh)
 
 
 @pytest.mark.parametrize("base_dtype", ["same", "bfloat16"])
@@ -93,8 +100,8 @@ def test_a_base_run_of_another_vocabulary_is_refused(tmp_path):
     experiment, mesh = dataclasses.replace(small, model=model), make_mesh(MESH, jax.devices()[:1])
     written = write_run(tmp_path / "run", model, "full")
     with pytest.raises(UserError, match=r"base: .* was trained with another vocabulary, .*--tokenizer"):
-        train.base_variables(experiment, mesh)
-    params = train.base_variables(dataclasses.replace(experiment, tokenizer=str(tmp_path / "run")), mesh)["params"]
+        base_of(experiment, mesh)
+    params = base_of(dataclasses.replace(experiment, tokenizer=str(tmp_path / "run")), mesh)["params"]
     np.testing.assert_array_equal(params["language"]["embedding"], written["params"]["language"]["embedding"])
 
 

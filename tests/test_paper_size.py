@@ -16,9 +16,9 @@ from dsvla_jax.encoding.text import WordTokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.variables import split_variables
 from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.suite_vocabulary import tokenizer_of
 from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
 from tests.vocabularies import small_tokenizer
-from train import tokenizer_of
 
 EXPERIMENT = get_config("paper_7b")
 
@@ -94,11 +94,11 @@ def test_the_papers_settings():
 def test_a_missing_or_foreign_vocabulary_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=r"tokenizers/llama/tokenizer\.json is missing, .*--tokenizer"):
-        tokenizer_of(EXPERIMENT)
+        tokenizer_of(EXPERIMENT.tokenizer, EXPERIMENT.model.language.vocab_size)
     folder = tmp_path / "tokenizers" / "llama"
     folder.mkdir(parents=True)
     tokenizer = WordTokenizer(("a", "b"))
     tokenizer.save(folder)
     assert load_tokenizer(folder) == tokenizer
     with pytest.raises(UserError, match=f"has {tokenizer.vocab_size} tokens, .* is 32000"):
-        tokenizer_of(EXPERIMENT)
+        tokenizer_of(EXPERIMENT.tokenizer, EXPERIMENT.model.language.vocab_size)

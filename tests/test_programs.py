@@ -1,10 +1,12 @@
 """The two programs as a person runs them: mistakes end in one clear message, a non-zero status and no traceback."""
 
 import os
+import runpy
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -28,6 +30,24 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     ("arguments", "expected"),
     [
         (["train.py", "tinny"], "unknown config 'tinny': did you mean 'tiny'?"),
+        (["eval.py", "nowhere"], "no run here"),
+        (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
+    ],
+)
+def test_a_program_ends_with_one_message(arguments: list[str], expected: str, tmp_path: Path):
+    if arguments[0].endswith(".py"):
+        arguments = [str(ROOT / arguments[0]), *arguments[1:]]
+    result = run(*arguments, folder=tmp_path)
+    text = result.stdout + result.stderr
+    assert result.returncode not in (0, None)
+    assert "Traceback" not in text
+    assert expected in text
+    assert not any(tmp_path.rglob("*.json")), "nothing is written for a mistake"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
         (
             ["train.py", "mine/tiny_lor.py"],
             "'mine/tiny_lor.py': no such file; did you mean 'tiny_lora'?",
@@ -37,22 +57,31 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         (["train.py", "tiny", "--data.tasks", "lamp_of"], "lamp_on"),
         (["train.py", "tiny", "--data.crop", "1.5"], "error: data.crop: expected more than 0, at most 1, got 1.5"),
         (["train.py", "tiny_oxe", "--oxe.horizon", "-1"], "error: oxe.horizon: expected at least 0, got -1.0"),
-        (["eval.py", "nowhere"], "no run here"),
         (["eval.py", "nowhere", "--compare", "elsewhere"], "no results under these conditions; evaluate first"),
-        (["-m", "data_pipelines.demos", "out", "--tasks", "lamp_of"], "lamp_on"),
         (["train.py", "tiny", "--run", "runs/lr=[0.1]"], "whose path contains [; choose another folder"),
         (["train.py", "tiny", "--run", "/dev/null/run"], "error: /dev/null/run: Not a directory; choose another path"),
-        (["-m", "data_pipelines.oxe", "fixtures", "/dev/null", "--datasets", "viola"], "error: /dev/null/viola"),
+        (["data_pipelines.oxe", "fixtures", "/dev/null", "--datasets", "viola"], "error: /dev/null/viola"),
     ],
 )
-def test_a_mistake_ends_in_one_message(arguments: list[str], expected: str, tmp_path: Path):
-    if arguments[0].endswith(".py"):
-        arguments = [str(ROOT / arguments[0]), *arguments[1:]]
-    result = run(*arguments, folder=tmp_path)
-    text = result.stdout + result.stderr
-    assert result.returncode not in (0, None)
-    assert "Traceback" not in text
-    assert expected in text
+def test_a_mistake_ends_in_one_message(
+    arguments: list[str],
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    """In the process of the tests, which has imported already what a program would."""
+    program, *rest = arguments
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(sys, "argv", [program, *rest])
+    is_file = program.endswith(".py")
+    start = partial(runpy.run_path, str(ROOT / program)) if is_file else partial(runpy.run_module, program)
+    with pytest.raises(SystemExit) as ended:
+        start(run_name="__main__")
+    assert ended.value.code not in (0, None)
+    printed = capsys.readouterr()
+    assert expected in printed.out + printed.err
     assert not any(tmp_path.rglob("*.json")), "nothing is written for a mistake"
 
 

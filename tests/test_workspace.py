@@ -26,6 +26,7 @@ from data_pipelines.recording import Recording, make_demonstration
 from data_pipelines.rlds.build import RldsBuild
 from data_pipelines.rlds.tfrecord import write_records
 from data_pipelines.rlds.writing import encode_image
+from data_pipelines.training_data import open_training_data, with_workspace
 from data_pipelines.workspace import View, count_points, fit_box, require_points
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.config import EncodingConfig
@@ -35,6 +36,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.observation_checks import MIN_WORKSPACE_SHARE
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
+from dsvla_jax.training.run_folder import require_same_experiment
 from dsvla_jax.training.sharding import BatchPart
 from tests import rlbench_files as files
 from tests.small import small_encoding, small_language, small_vision
@@ -209,16 +211,16 @@ def test_a_run_is_refused_before_it_has_a_config_and_keeps_the_box_that_was_fitt
     assert not (run / "config.json").exists()
 
     asked = experiment_for(tmp_path / "low", fit_workspace=True)
-    fitted = train.with_workspace(asked, run, tokenizer)
+    fitted = with_workspace(asked, run, tokenizer)
     assert 0 < fitted.encoding.workspace_low[2] < 0.01
-    train.open_data(fitted, tokenizer, BatchPart(0, 1, 2))
+    open_training_data(fitted, tokenizer, BatchPart(0, 1, 2))
     assert "points in the workspace (mean of 3 samples)" in capsys.readouterr().out
     (run / "checkpoints" / "1").mkdir(parents=True)
     save_experiment(run / "config.json", fitted)
 
     # The same command resumes with the same box, though the data have grown.
     write_episodes(tmp_path / "low", [episode(-files.TABLE), episode(-files.TABLE - 0.3)])
-    again = train.with_workspace(asked, run, tokenizer)
+    again = with_workspace(asked, run, tokenizer)
     assert again == fitted
-    train.require_same_experiment(run, again)
-    assert train.with_workspace(asked, tmp_path / "another", tokenizer) != fitted
+    require_same_experiment(run, again)
+    assert with_workspace(asked, tmp_path / "another", tokenizer) != fitted

@@ -1,0 +1,109 @@
+"""What a run trains on and is validated with: batches of demonstrations, or of Open X-Embodiment episodes."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+from data_pipelines.first_look import fit_workspace, look_at_demonstrations, look_at_mixture
+from data_pipelines.learned_from import learned_from, learned_from_oxe
+from data_pipelines.loader import make_loader
+from data_pipelines.samples import make_sampler, make_validation_sampler
+from data_pipelines.sources import open_demonstrations, open_held_out
+from dsvla_jax.checkpoints.steps import has_checkpoints
+from dsvla_jax.data_config import LearnedFrom
+from dsvla_jax.encoding.displacement import DisplacementScale
+from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.experiment import Experiment, load_experiment
+from dsvla_jax.training.distributed import first_process_first
+from dsvla_jax.training.loop import Batches
+from dsvla_jax.training.sharding import BatchPart
+from dsvla_jax.types import HeldOutExample
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingData:
+    """What a run trains on."""
+
+    batches: Batches
+    """This process's parts of the batches."""
+    samples: int
+    """How many different samples there are."""
+    displacement: DisplacementScale | None
+    """What displacements are binned over, if the targets are such."""
+    learned_from: LearnedFrom
+
+
+class _Order(TypedDict):
+    seed: int
+    process_index: int
+    process_count: int
+
+
+def open_training_data(experiment: Experiment, tokenizer: Tokenizer, part: BatchPart) -> TrainingData:
+    """Opens the data of an experiment, which generates what is missing of simulated demonstrations, and looks at it.
+
+    part: of every batch, that of this process. Prints what it found. Raises UserError or DataError for data that cannot
+    be learned from.
+    """
+    encoding, oxe = experiment.encoding, experiment.oxe
+    order = _order(experiment, part)
+    if oxe is not None:
+        # Its feature definitions take a second to import, which no other run needs.
+        from data_pipelines.oxe.loader import OxeLoader
+
+        loader = OxeLoader(oxe, encoding, tokenizer, batch_size=part.size, **order)
+        print(*look_at_mixture(loader.source.datasets, encoding), sep="\n")
+        learned = learned_from_oxe(oxe, [len(item.dataset.arms) for item in loader.source.datasets])
+        return TrainingData(loader, loader.num_samples, loader.scale, learned)
+    with first_process_first("demonstrations"):
+        reader = open_demonstrations(experiment.data, tokenizer)
+    print(look_at_demonstrations(reader, encoding))
+    batches = make_loader(reader, make_sampler(experiment.data, encoding, tokenizer), batch_size=part.size, **order)
+    return TrainingData(batches, reader.num_frames, None, learned_from(experiment.data, encoding.use_keypoints))
+
+
+def open_validation_data(
+    experiment: Experiment, tokenizer: Tokenizer, part: BatchPart
+) -> Callable[[], Iterator[HeldOutExample[np.ndarray]]]:
+    """Opens the demonstrations held out of training.
+
+    Returns a function that starts again from the first batch: this process's parts of all batches, the same each time;
+    none if nothing is validated.
+    """
+    if not experiment.validate_every:
+        return lambda: iter(())
+    with first_process_first("held-out demonstrations"):
+        reader = open_held_out(experiment.data, tokenizer, experiment.validation.episodes)
+    sample = make_validation_sampler(experiment.data, experiment.encoding, tokenizer)
+    # A pass forward over the part of a batch that is trained on at a time fits where training does.
+    size = part.size // experiment.gradient_accumulation
+    count = min(experiment.validation.batches, max(reader.num_frames // (size * part.count), 1))
+    order = _order(experiment, part)
+
+    def batches() -> Iterator[HeldOutExample[np.ndarray]]:
+        return itertools.islice(make_loader(reader, sample, batch_size=size, num_threads=0, **order), count)
+
+    return batches
+
+
+def with_workspace(experiment: Experiment, run: Path, tokenizer: Tokenizer) -> Experiment:
+    """Returns the experiment with the workspace of its run, or else fitted to its data, if it is to be fitted."""
+    if not (experiment.fit_workspace and experiment.encoding.use_points):
+        return experiment
+    config = run / "config.json"
+    if config.exists() and has_checkpoints(run):
+        known = load_experiment(config).encoding
+        box = {"workspace_low": known.workspace_low, "workspace_high": known.workspace_high}
+        return dataclasses.replace(experiment, encoding=dataclasses.replace(experiment.encoding, **box))
+    with first_process_first("demonstrations"):
+        encoding = fit_workspace(experiment.data, experiment.oxe, experiment.encoding, tokenizer)
+    print(f"workspace fitted: from {encoding.workspace_low} to {encoding.workspace_high}")
+    return dataclasses.replace(experiment, encoding=encoding)
+
+
+def _order(experiment: Experiment, part: BatchPart) -> _Order:
+    return {"seed": experiment.seed, "process_index": part.index, "process_count": part.count}
