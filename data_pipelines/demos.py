@@ -96,7 +96,7 @@ class Options(Settings):
 class ScriptedExpert:
     """Demonstrations of one task by its scripted expert."""
 
-    def __init__(self, task: str, settings: Settings):
+    def __init__(self, task: str, settings: Settings) -> None:
         self.task = get_task(task)
         self.settings = settings
         self.environment = Environment(self.task, physics="mujoco", image_size=settings.image_size)

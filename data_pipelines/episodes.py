@@ -184,7 +184,7 @@ class EpisodeReader:
         skip: int = 0,
         fewer: bool = False,
         verify: Literal["size", "sha256"] = "size",
-    ):
+    ) -> None:
         self.folder = Path(folder)
         index = read_index(self.folder)
         present = sorted({entry["task"] for entry in index["shards"] if entry["frames"]})

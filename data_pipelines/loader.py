@@ -19,7 +19,7 @@ Sample = TypeVar("Sample")
 class FrameSource(grain.sources.RandomAccessDataSource[Frame]):
     """The frames of a reader as a grain random-access source."""
 
-    def __init__(self, reader: EpisodeReader):
+    def __init__(self, reader: EpisodeReader) -> None:
         self._reader = reader
 
     def __len__(self) -> int:
@@ -35,7 +35,7 @@ class FrameSource(grain.sources.RandomAccessDataSource[Frame]):
 class EpisodeLoader(Iterator[Sample], Generic[Sample]):
     """Batches with a position that can be saved, together with what it is a position in; made by `make_loader`."""
 
-    def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: dict[str, Any]):
+    def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: dict[str, Any]) -> None:
         self._batches, self._folder, self._contents = batches, folder, contents
 
     def __next__(self) -> Sample:

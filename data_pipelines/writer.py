@@ -53,7 +53,7 @@ class DemonstrationWriter:
         codec: PoseCodec | None = None,
         still: float = STILL,
         stop_buffer: int = STOP_BUFFER,
-    ):
+    ) -> None:
         require(every_n >= 0, "every_n", at_least(0), every_n)
         require(0 <= still < math.inf, "still", at_least(0), still)
         require(stop_buffer >= 0, "stop_buffer", at_least(0), stop_buffer)

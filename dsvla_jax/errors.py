@@ -10,7 +10,7 @@ class UserError(ValueError):
 class DataError(UserError):
     """Recorded data that must not be used: says which file and field, what was expected, and what to do about it."""
 
-    def __init__(self, where: object, field: str, expected: str, got: str, fix: str):
+    def __init__(self, where: object, field: str, expected: str, got: str, fix: str) -> None:
         super().__init__(f"{where}: {field}: expected {expected}, got {got}; {fix}")
 
     def __reduce__(self) -> tuple[object, ...]:

@@ -50,7 +50,9 @@ class SimulatedRobot:
         (segmentation), the task's own (oracle), or none.
     """
 
-    def __init__(self, task: str, image_size: int, seed: int, keypoints: Literal["segmentation", "oracle", "none"]):
+    def __init__(
+        self, task: str, image_size: int, seed: int, keypoints: Literal["segmentation", "oracle", "none"]
+    ) -> None:
         self.environment = Environment(task, image_size=image_size)
         self._state = self.environment.reset(episode_keys(0, "eval", task, seed, 1))
         self.prompt = self.environment.instructions(self._state, seed)[0]
@@ -90,7 +92,7 @@ class SimulatedRobot:
 class DryRun:
     """Another robot's eyes, but no motion: says what it would do, and complains where that is far or out of bounds."""
 
-    def __init__(self, robot: Robot, low: list[float], high: list[float], longest_move: float):
+    def __init__(self, robot: Robot, low: list[float], high: list[float], longest_move: float) -> None:
         self._robot, self._low, self._high, self._longest = robot, np.array(low), np.array(high), longest_move
 
     def observe(self) -> dict[str, Any]:

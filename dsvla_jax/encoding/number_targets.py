@@ -43,7 +43,7 @@ class NumberTargets:
 class NumberRows:
     """The rows of `NumberTargets` in the answers of one and two arms."""
 
-    def __init__(self, tokenizer: Tokenizer, style: Style):
+    def __init__(self, tokenizer: Tokenizer, style: Style) -> None:
         self._grammars = {arms: build_answer_grammar(tokenizer, arms, style) for arms in (1, 2)}
         self._numbers: dict[_Choice, int] = {}
         self._rows = {arms: [self._slot_rows(s) for s in grammar.slots] for arms, grammar in self._grammars.items()}

@@ -183,7 +183,7 @@ class Llama(nn.Module):
 
     config: ModelConfig
 
-    def setup(self):
+    def setup(self) -> None:
         language = self.config.language
         # Unit-norm rows: with tied weights the first logits then have unit variance.
         self.embedding = self.param(

@@ -50,7 +50,7 @@ class VLA(nn.Module):
 
     config: ModelConfig
 
-    def setup(self):
+    def setup(self) -> None:
         self.vision = VisionTower(self.config)
         # Both are the paper's projection module, and have one name, under which regimes and checkpoints know it.
         self.projector = VisualPrompt(self.config) if self.config.fusion == "adapter" else Projector(self.config)

@@ -62,7 +62,7 @@ class GroundedSegmenter:
         segmenter_processor: Any,
         box_threshold: float = 0.3,
         device: str = "cpu",
-    ):
+    ) -> None:
         self._detector, self._segmenter = detector.to(device).eval(), segmenter.to(device).eval()
         self._read_detector, self._read_segmenter = detector_processor, segmenter_processor
         self._threshold, self._device = box_threshold, device

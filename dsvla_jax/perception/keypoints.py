@@ -42,7 +42,7 @@ class Sighting:
 class KeypointsNotFound(UserError):
     """Some object of the instruction was not found; the message names each and says why."""
 
-    def __init__(self, sightings: Sequence[Sighting]):
+    def __init__(self, sightings: Sequence[Sighting]) -> None:
         self.sightings = sightings
         problems = [f"{sighting.phrase!r}: {sighting.problem}" for sighting in sightings if sighting.point is None]
         super().__init__("keypoints not found: " + "; ".join(problems))
@@ -128,7 +128,7 @@ class KeypointTracker:
     where it was last seen; only in the first frame of an episode must all be found.
     """
 
-    def __init__(self, segment: Segmenter, refresh: bool = False):
+    def __init__(self, segment: Segmenter, refresh: bool = False) -> None:
         self._segment, self._refresh = segment, refresh
         self._known: dict[str, Sighting] = {}
 

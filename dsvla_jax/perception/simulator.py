@@ -47,7 +47,7 @@ class SegmentationKeypoints:
     otherwise the first frame's keypoints are kept. Raises UserError for a task that names no objects.
     """
 
-    def __init__(self, environment: Environment, state: SimState, refresh: bool = False):
+    def __init__(self, environment: Environment, state: SimState, refresh: bool = False) -> None:
         self._environment = environment
         task = environment.task
         self._arms = [task.phrases(task.words(variation)) for variation in np.asarray(state.variation).tolist()]

@@ -94,7 +94,7 @@ class MicroBatcher:
     ``answer`` runs in a thread of its own, so that connections stay alive. largest: most questions of a batch.
     """
 
-    def __init__(self, answer: Callable[[Sequence[Question]], Sequence[Answer]], largest: int):
+    def __init__(self, answer: Callable[[Sequence[Question]], Sequence[Answer]], largest: int) -> None:
         self._answer, self._largest = answer, largest
         self._waiting: list[tuple[Question, asyncio.Future[tuple[Answer, Timing]], float]] = []
         self._arrived = asyncio.Event()

@@ -37,7 +37,9 @@ class PolicyClient:
     timeout: seconds to connect and receive the metadata, and then seconds for each reply.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8000, token: str | None = None, timeout: float = 60.0):
+    def __init__(
+        self, host: str = "127.0.0.1", port: int = 8000, token: str | None = None, timeout: float = 60.0
+    ) -> None:
         self.address = f"ws://{host}:{port}"
         if not timeout > 0:
             raise UserError(f"timeout: expected more than 0 seconds, got {timeout}")

@@ -115,7 +115,7 @@ class PolicyServer:
         token: str | None = None,
         name: str = "policy",
         perception: Perception | None = None,
-    ):
+    ) -> None:
         self.limits = limits or Limits()
         encoding = policy.config.encoding
         self.expected = Expected(

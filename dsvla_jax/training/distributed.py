@@ -90,7 +90,7 @@ class Watchdog:
     Does nothing in a program that runs alone.
     """
 
-    def __init__(self, folder: Path, silence: float = 60.0, limit: float = 1800.0, interval: float = 5.0):
+    def __init__(self, folder: Path, silence: float = 60.0, limit: float = 1800.0, interval: float = 5.0) -> None:
         self._folder, self._silence, self._limit, self._interval = folder, silence, limit, interval
         self._index, self._count = jax.process_index(), jax.process_count()
         # Files of an earlier job in the same folder mean nothing: all processes agree on a number for this one.

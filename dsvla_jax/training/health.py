@@ -23,7 +23,7 @@ class SkippedSteps:
     folder: where the batches go. limit: skipped steps that a run may have. seen: those it had already.
     """
 
-    def __init__(self, folder: Path, limit: int, seen: int):
+    def __init__(self, folder: Path, limit: int, seen: int) -> None:
         self._folder, self._limit, self._seen = folder, limit, seen
         self._pending: tuple[int, Example[np.ndarray], Array] | None = None
 

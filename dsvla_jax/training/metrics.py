@@ -24,7 +24,7 @@ class MetricsWriter:
     step: that of the checkpoint, or 0. wandb_project: the Weights & Biases project to write to as well, if any.
     """
 
-    def __init__(self, run: Path, step: int, wandb_project: str = "", config: Mapping[str, Any] | None = None):
+    def __init__(self, run: Path, step: int, wandb_project: str = "", config: Mapping[str, Any] | None = None) -> None:
         writes = jax.process_index() == 0
         self._path = run / FILE if writes else Path(os.devnull)
         if writes:
