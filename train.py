@@ -60,11 +60,11 @@ from dsvla_jax.weights.base_variables import base_variables
 def prepare(
     experiment: Experiment, run: Path
 ) -> tuple[Experiment, Tokenizer, jax.sharding.Mesh, BatchPart, tuple[int, int]]:
-    """The experiment with the names of its tasks, its vocabulary, the mesh, this process's part of a batch, and height
-    and width of the pictures that it learns from. Writes nothing but demonstrations to fit the workspace to.
+    """Completes and checks an experiment. Writes nothing but demonstrations to fit the workspace to.
 
-    Raises UserError, naming the options, where settings contradict one another, the vocabulary, the base, the pictures,
-    or what the run folder holds.
+    Returns the experiment with the names of its tasks, its vocabulary, the mesh, this process's part of a batch, and
+    height and width of the pictures that it learns from. Raises UserError, naming the options, if settings contradict
+    one another, the vocabulary, the base, the pictures, or what the run folder holds.
     """
     require_writable_path(run)
     tokenizer = tokenizer_of(experiment.tokenizer, experiment.model.language.vocab_size)

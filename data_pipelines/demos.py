@@ -265,8 +265,10 @@ def complete_task(
     demonstrator: Callable[[str, Settings], Demonstrate],
     keep: Callable[[dict[str, Any], int, int], None],
 ) -> None:
-    """Writes the missing shards of one task. keep(index entry, successes, attempts) is told of each shard, old or new;
-    an old one took no attempts."""
+    """Writes the missing shards of one task.
+
+    keep: called with (index entry, successes, attempts) of each shard, old or new; an old one took no attempts.
+    """
     kept, number, demonstrate = 0, 0, None
     while kept < episodes:
         name = shard_name(task, number)
@@ -308,8 +310,10 @@ def is_complete(
 
 
 def is_usable(folder: Path, entry: dict[str, Any], needed: int, digest: bool = True) -> bool:
-    """Whether a shard of the index is there and, if it was cut short when fewer episodes were asked for, long enough.
-    Raises DataError for one that is there but damaged: nobody's file is overwritten unasked."""
+    """Returns whether a shard of the index is there, and is long enough if it was cut short when fewer were asked for.
+
+    Raises DataError for one that is there but damaged: no file is overwritten unasked.
+    """
     if (entry["cut"] and len(entry["frames"]) < needed) or not (folder / entry["file"]).exists():
         return False
     check_shard(folder, entry, digest)

@@ -178,11 +178,11 @@ M_MMAP_MAX, M_TRIM_THRESHOLD, M_ARENA_MAX = -4, -1, -8
 
 
 def keep_freed_memory() -> None:
-    """Keeps what is freed for the process's next use instead of handing it back to the system. Call it before threads
-    start; without glibc it does nothing.
+    """Keeps freed memory for the process's next use instead of returning it to the system.
 
-    XLA's CPU client allocates a program's temporaries anew at every call. As blocks of their own they would come as
-    fresh pages each time, and to fault those in takes a fifth of a training step.
+    Call it before threads start; without glibc it does nothing. XLA's CPU client allocates a program's temporaries anew
+    at every call. As blocks of their own they would come as fresh pages each time, and to fault those in takes a fifth
+    of a training step.
     """
     with contextlib.suppress(AttributeError, OSError):
         mallopt = ctypes.CDLL(None).mallopt

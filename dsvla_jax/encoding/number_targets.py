@@ -53,8 +53,10 @@ class NumberRows:
         return self._along(integers, lambda index, place: self._rows[len(integers)][index][place])
 
     def numbers(self, integers: np.ndarray) -> np.ndarray:
-        """Action integers (A, 8) -> int32 (L,), which number each of the answer's tokens belongs to, 1 to 8 A; 0 for
-        those between numbers."""
+        """Returns which number of an answer each of its tokens belongs to.
+
+        integers: the answer's (A, 8). Returns int32 (L,): 1 to 8 A, and 0 for tokens between numbers.
+        """
         slots = self._grammars[len(integers)].slots
         return self._along(integers, lambda index, place: [index + 1] * len(slots[index].tokens[place]))
 

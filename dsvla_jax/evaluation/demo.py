@@ -66,8 +66,10 @@ class Step:
 
 
 def draw_tokens(rgb: np.ndarray, centers: np.ndarray, patches: np.ndarray, camera, grid: int) -> np.ndarray:
-    """The picture, enlarged, with each 3D token's centre (G, 3) joined to the middle of its patch (G,); patches that
-    have tokens are outlined. A token of the workspace's far side is blue, of the near side yellow."""
+    """Draws the enlarged picture with each 3D token's centre (G, 3) joined to the middle of its patch (G,).
+
+    Patches that have tokens are outlined. A token of the workspace's far side is blue, of the near side yellow.
+    """
     height, width = rgb.shape[:2]
     picture = cv2.resize(rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST)
     pixels, depth = (np.asarray(x) for x in project(jnp.asarray(centers), camera))

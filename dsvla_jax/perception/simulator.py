@@ -40,8 +40,10 @@ def keypoint_source(kind: Keypoints, environment: Environment) -> "Callable[[Sim
 
 
 class SegmentationKeypoints:
-    """A `rollout.KeypointSource` for one batch of episodes: the simulator's masks of the task's objects and the depth
-    seen on them, through the geometry that a robot's pictures go through.
+    """Finds the keypoints of a batch of simulated episodes; a `loop.KeypointSource`.
+
+    The simulator's masks of the task's objects, and the depth seen on them, go through the geometry that a robot's
+    pictures go through.
 
     state: the reset state of the B episodes. refresh: looks again before every keyframe, see `KeypointTracker`;
     otherwise the first frame's keypoints are kept. Raises UserError for a task that names no objects.

@@ -58,8 +58,9 @@ class Plan:
 
 
 def planning_tokenizer(experiment: Experiment) -> Tokenizer:
-    """The experiment's vocabulary where its folder is there; otherwise a small one in its place, of which an integer is
-    one token. Nothing but the few numbers of an answer depends on it.
+    """Loads the experiment's vocabulary, or a small one if its folder is missing.
+
+    An integer of the small one is one token. Nothing but the few numbers of an answer depends on it.
     """
     folder = Path(experiment.tokenizer)
     return load_tokenizer(folder) if experiment.tokenizer and folder.exists() else WordTokenizer(vocabulary(()))

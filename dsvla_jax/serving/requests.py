@@ -74,8 +74,11 @@ class Expected:
 
     @property
     def max_message_bytes(self) -> int:
-        """The largest request: colour and depth in double precision, so that a picture of another type arrives and is
-        refused by its name, and room for all else."""
+        """Bytes of the largest request that is read.
+
+        Colour and depth count in double precision, so that a picture of another type arrives and is refused by its
+        name.
+        """
         return max(height * width for height, width in self.image_sizes) * (3 + 1) * 8 + 2**16
 
 

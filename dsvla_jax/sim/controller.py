@@ -148,8 +148,10 @@ def hand_pose(tool_pose: Array) -> Array:
 
 
 def weld_row(hand: Array, body: Array) -> Array:
-    """The eq_data (mjNEQDATA = 12,) of a weld that holds ``body`` (7,) where it now is relative to ``hand`` (7,):
-    anchor, position, quaternion wxyz, torque scale, and a zero that says that the pose is given."""
+    """Returns the eq_data (mjNEQDATA = 12,) of a weld that holds ``body`` (7,) where it is relative to ``hand`` (7,).
+
+    It is anchor, position, quaternion wxyz, torque scale, and a zero that says that the pose is given.
+    """
     inverse = quaternion_conjugate(hand[3:])
     position = quaternion_rotate(inverse, body[:3] - hand[:3])
     turn = quaternion_to_wxyz(quaternion_multiply(inverse, body[3:]))
@@ -173,6 +175,7 @@ def attach(
         tool_poses: float32 (A, 7). closing: bool (A,).
         body_poses: float32 (N, 7). half_extents, centres: (N, 3), the graspables' boxes in their bodies' frames.
         welds: int (A, N).
+
     Returns:
         the new eq_active and eq_data.
     """

@@ -35,8 +35,11 @@ class EndEffectors(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """wrong: bool (B,), some hand has ever held a graspable that is not among the task's targets. dropped: bool (B,), a
-    target has been held, and none is held now."""
+    """What the hands of B episodes have taken and lost.
+
+    wrong: bool (B,), some hand has ever held a graspable that is not among the task's targets. dropped: bool (B,), a
+    target has been held, and none is held now.
+    """
 
     wrong: Array
     dropped: Array
@@ -218,8 +221,9 @@ def _attach(scene: Scene, state: SimState, ok: Array, closing: Array) -> SimStat
 
 
 class Environment:
-    """A task in a simulator: the functions of this module, compiled for its scene. It holds no episode's state: every
-    method is a function of its arguments.
+    """A task in a simulator: the functions of this module, compiled for its scene.
+
+    It holds no episode's state: every method is a function of its arguments.
 
     task: a Task or its name. physics: "mujoco" (C, for CPUs) or "mjx" (accelerators, jitted throughout). To step inside
         a larger jitted program, pass ``environment.physics`` to it and call `step` with ``environment.scene``.

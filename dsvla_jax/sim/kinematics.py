@@ -42,8 +42,10 @@ _TOOL_POSITION = robot.LINK_POSITIONS[7] + _LINK_ROTATIONS[7] @ robot.TCP_POSITI
 
 
 class Chain(NamedTuple):
-    """The arm at one posture, in the world. axes, origins: float32 (7, 3) of the joints. rotation (3, 3) and position
-    (3,) of the tool centre point."""
+    """The arm at one posture, in the world.
+
+    axes, origins: float32 (7, 3), of the joints. rotation: (3, 3), position: (3,), of the tool centre point.
+    """
 
     axes: Array
     origins: Array
@@ -111,6 +113,7 @@ def track(targets: Array, seed: Array, base: Array) -> Array:
     Args:
         targets: float32 (M, 7), unit quaternions. seed: float32 (7,) joint angles.
         base: float32 (7,) pose of the arm's base in the world.
+
     Returns:
         float32 (M, 7) joint angles after each step, within the limits.
     """

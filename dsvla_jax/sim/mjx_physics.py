@@ -40,8 +40,11 @@ class MjxConstants:
 
 @struct.dataclass
 class MjxPhysics:
-    """A `Physics` whose leaves are the model's arrays. Pass it to the enclosing jit (see ``jit_with_mjx``) as an
-    argument, so that the model is not baked into the program as constants."""
+    """A `Physics` whose leaves are the model's arrays.
+
+    Pass it to the enclosing jit (see ``jit_with_mjx``) as an argument, so that the model is not baked into the program
+    as constants.
+    """
 
     model: mjx.Model
     constants: MjxConstants = struct.field(pytree_node=False)
@@ -124,8 +127,10 @@ def _run(model: mjx.Model, constants: MjxConstants, state: SimState, controls: A
 
 
 def _with_state(model: mjx.Model, constants: MjxConstants, state: SimState) -> mjx.Model:
-    """The model of one episode: its welds, and its furniture where the mocap poses are. MJX moves a mocap body without
-    the bodies that hang from it; those follow the model's own pose of the body."""
+    """Returns the model of one episode: its welds, and its furniture where the mocap poses are.
+
+    MJX moves a mocap body without the bodies that hang from it; those follow the model's own pose of the body.
+    """
     if constants.resize:
         model = model.replace(geom_size=state.geom_size, geom_pos=state.geom_pos)
     bodies, rows = constants.mocap_bodies, constants.mocap_ids

@@ -145,7 +145,9 @@ def jit_with_mjx(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 
 def jit_on_one_thread(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """``jax.jit`` for programs of many tiny matrix products one after the other, such as inverse kinematics: on a CPU,
-    to hand them to a pool of threads takes longer than to multiply them."""
+    """Compiles programs of many tiny matrix products one after the other, such as inverse kinematics.
+
+    On a CPU, to hand them to a pool of threads takes longer than to multiply them.
+    """
     options = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
     return jax.jit(function, compiler_options=options)

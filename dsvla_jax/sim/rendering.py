@@ -16,8 +16,11 @@ MAX_RAYS = 2**21  # cast at once over all episodes: more need gigabytes
 
 
 class Rendering(NamedTuple):
-    """rgb: uint8 (B, H, W, 3). depth: float32 (B, H, W), planar, metres; 0 where nothing is hit. segmentation: int32
-    (B, H, W), geom ids, -1 for the sky."""
+    """Pictures of B episodes.
+
+    rgb: uint8 (B, H, W, 3). depth: float32 (B, H, W), planar, metres; 0 where nothing is hit. segmentation: int32
+    (B, H, W), geom ids, -1 for the sky.
+    """
 
     rgb: Array
     depth: Array

@@ -60,8 +60,10 @@ ARM_PREFIXES = ("left_", "right_")  # a single arm is called left
 
 @dataclass(frozen=True)
 class CollisionBits:
-    """MuJoCo's (contype, conaffinity) of one kind of geom: a pair collides if either's contype meets the other's
-    conaffinity."""
+    """MuJoCo's (contype, conaffinity) of one kind of geom.
+
+    A pair collides if either's contype meets the other's conaffinity.
+    """
 
     contype: int
     conaffinity: int

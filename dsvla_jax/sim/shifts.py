@@ -39,8 +39,11 @@ ASIDE, ALONG = (0.34, 0.46), (0.02, 0.4)
 
 @struct.dataclass
 class Start:
-    """How an episode begins, and how it is looked at. camera: of one example. light: float32 (3,), unit, the
-    direction in which light travels. geom_size, geom_pos: float32 (ngeom, 3), in their bodies' frames."""
+    """How an episode begins, and how it is looked at.
+
+    camera: of one example. light: float32 (3,), unit, the direction in which light travels. geom_size, geom_pos:
+    float32 (ngeom, 3), in their bodies' frames.
+    """
 
     scene: SceneState
     camera: Camera
@@ -68,8 +71,10 @@ def shift(scene: Scene, key: Array, start: Start) -> Start:
 
 
 def other_instance(scene: Scene, key: Array, start: Start) -> Start:
-    """Turns the hue of each of the task's bodies (only brightens or darkens them where colours tell objects apart), and
-    resizes those that the task lets."""
+    """Turns the hue of each of the task's bodies, and resizes those that the task lets.
+
+    Where colours tell objects apart, it only brightens or darkens them.
+    """
     model, task = scene.mj_model, scene.task
     hue_key, bright_key, size_key, side_key = jax.random.split(key, 4)
     mine = np.array([_is_of_task(model, geom) for geom in range(model.ngeom)])

@@ -16,8 +16,11 @@ from dsvla_jax.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class Chip:
-    """Published peaks of one chip: bfloat16 products a second, bytes of main memory, bytes a second from it and to the
-    other chips (all links together)."""
+    """Published peaks of one chip.
+
+    bfloat16 products a second, bytes of main memory, bytes a second from it, and to the other chips (all links
+    together).
+    """
 
     flops: float
     memory: float

@@ -20,8 +20,10 @@ Passes = Literal["training", "inference"]
 
 @dataclasses.dataclass(frozen=True)
 class _Block:
-    """One transformer layer, repeated. products: (name, tokens, inputs, outputs) in order. pairs: of its attentions,
-    times heads and head width."""
+    """One transformer layer, repeated.
+
+    products: (name, tokens, inputs, outputs) in order. pairs: of its attentions, times heads and head width.
+    """
 
     layers: int
     products: tuple[tuple[str, int, int, int], ...]
@@ -36,8 +38,10 @@ def training_flops(experiment: Experiment) -> dict[str, int]:
 
 
 def model_flops(experiment: Experiment) -> int:
-    """Of one example in one training step, without what rematerialisation computes again: what the utilisation of a
-    chip is counted by (PaLM, https://arxiv.org/abs/2204.02311, appendix B)."""
+    """Counts the FLOPs of one example in one training step, without what rematerialisation computes again.
+
+    The utilisation of a chip is counted by them (PaLM, https://arxiv.org/abs/2204.02311, appendix B).
+    """
     plain = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, remat="none"))
     return sum(training_flops(plain).values())
 

@@ -55,12 +55,11 @@ class SkippedSteps:
 
 
 class Clock:
-    """Seconds a step, examples and tokens a second, what of the chips that uses, and the share of the time that
-    training waited for data.
+    """Measures speed, utilisation, and the share of the time that training waits for data.
 
     Counts from the end of the first step, which compiles.
 
-    flops: of one example in one step. peak: what all chips could do a second; None where nobody has said.
+    flops: of one example in one step. peak: what all chips could do a second; None if it is not known.
     """
 
     def __init__(self, flops: float, peak: float | None) -> None:

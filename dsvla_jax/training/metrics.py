@@ -18,8 +18,9 @@ FILE = "metrics.jsonl"
 
 
 class MetricsWriter:
-    """Writes one line a step, in process 0. A run that goes on from a checkpoint first forgets what came after it, so
-    that the file holds each step once.
+    """Writes one line a step, in process 0.
+
+    A run that resumes from a checkpoint first forgets what came after it, so that the file holds each step once.
 
     step: that of the checkpoint, or 0. wandb_project: the Weights & Biases project to write to as well, if any.
     """

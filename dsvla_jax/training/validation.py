@@ -32,10 +32,10 @@ _BINS = slice(0, _GRIPPER)
 
 
 def jit_validation(experiment: Experiment, targets: NumberTargets, mesh: Mesh) -> Any:
-    """``sums(trainable, frozen, batch)``, compiled for a mesh: by name, a figure's sum over a batch and over how many
-    (`mean_errors`).
+    """Compiles ``sums(trainable, frozen, batch)`` for a mesh.
 
-    The batch is of `data_pipelines.samples.make_validation_sampler`.
+    It returns, by name, a figure's sum over a batch and over how many (`mean_errors`). The batch is of
+    `data_pipelines.samples.make_validation_sampler`.
     """
     model = VLA(experiment.model)
 
@@ -105,8 +105,9 @@ def number_errors(
 def mean_errors(
     sums: Any, trainable: Variables, frozen: Variables, batches: Iterable[HeldOutExample[np.ndarray]], mesh: Mesh
 ) -> dict[str, float]:
-    """The means over all batches by name: validation/loss, bin_exact, bin_within_one, position_cm, rotation_degrees,
-    gripper.
+    """Returns the means over all batches, by name.
+
+    They are validation/loss, bin_exact, bin_within_one, position_cm, rotation_degrees and gripper.
 
     sums: of `jit_validation`. batches: this process's parts, on the host.
     """

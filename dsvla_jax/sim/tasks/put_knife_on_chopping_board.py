@@ -95,8 +95,10 @@ def _success(view: task.StateView) -> Array:
 
 
 def _along(pose: Array) -> Array:
-    """The quaternion (4,) of a gripper onto the flat of a knife that lies along the x axis of ``pose`` (7,). Of the two
-    ways to hold it, the one that the wrist reaches; both bodies head to the same side."""
+    """Returns the quaternion (4,) of a gripper onto the flat of a knife that lies along the x axis of ``pose`` (7,).
+
+    Of the two ways to hold it, the one that the wrist reaches; both bodies head to the same side.
+    """
     turn = jnp.where(task.yaw_of(pose) < 0, jnp.pi, 0.0)
     turned = rotations.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), turn)
     return rotations.quaternion_multiply(rotations.quaternion_multiply(pose[3:], turned), rotations.DOWN)

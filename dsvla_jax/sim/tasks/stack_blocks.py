@@ -104,8 +104,11 @@ def _success(view: task.StateView) -> Array:
 
 
 def _grasp(pose: Array) -> Array:
-    """The quaternion (4,) of a gripper straight down onto a block. Of the four ways, the one whose fingers, and with
-    them the long side of the hand, are within 45 degrees of the x axis: across the way to the tower."""
+    """Returns the quaternion (4,) of a gripper straight down onto a block.
+
+    Of the four ways, the one whose fingers, and with them the long side of the hand, are within 45 degrees of the x
+    axis: across the way to the tower.
+    """
     yaw = jnp.mod(task.yaw_of(pose) - jnp.pi / 4, jnp.pi / 2) + jnp.pi / 4
     turn = rotations.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw)
     return rotations.quaternion_multiply(turn, rotations.DOWN)

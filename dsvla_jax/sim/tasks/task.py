@@ -105,8 +105,10 @@ class StateView:
     layout: StateLayout = struct.field(pytree_node=False)
 
     def body_pose(self, name: str) -> Array:
-        """The world pose (7,), quaternion xyzw, of a loose object, of a piece of furniture (a mocap body) or of what
-        hangs on one of them."""
+        """Returns the world pose (7,), quaternion xyzw, of a body.
+
+        name: a loose object, a piece of furniture (a mocap body), or what hangs on one of them.
+        """
         if name in self.layout.mocap:
             i = self.layout.mocap[name]
             return jnp.concatenate([self.mocap_pos[i], rotations.quaternion_from_wxyz(self.mocap_quat[i])])
@@ -164,8 +166,9 @@ class Placement:
 
 @dataclasses.dataclass(frozen=True)
 class Graspable:
-    """A loose object, or a link of one, that a closing gripper attaches to, if the tool centre point is within 1 cm of
-    its box.
+    """A loose object, or a link of one, that a closing gripper attaches to within 1 cm of its box.
+
+    The distance is that of the tool centre point.
 
     half_extents: metres. centre: of the box. Both in the body's frame.
     """
@@ -330,16 +333,22 @@ def upright_pose(x: Array, y: Array, z: Array | float, yaw: Array | float = 0.0)
 
 
 def pointing_down(yaw: Array | float = 0.0) -> Array:
-    """The quaternion (4,) of a gripper straight down whose fingers open along the y axis of a body turned by ``yaw``
-    radians about the vertical. Of the two turns half a circle apart, which grasp alike, the one within a quarter."""
+    """Returns the quaternion (4,) of a gripper straight down, fingers opening along the y axis of a turned body.
+
+    yaw: the body's turn about the vertical, radians. Of the two turns half a circle apart, which grasp alike, the one
+    within a quarter.
+    """
     yaw = jnp.mod(jnp.asarray(yaw, jnp.float32) + jnp.pi / 2, jnp.pi) - jnp.pi / 2
     turn = rotations.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), yaw)
     return rotations.quaternion_multiply(turn, rotations.DOWN)
 
 
 def leaning(angle: float, yaw: Array | float = 0.0) -> Array:
-    """The quaternion (4,) of a gripper that comes along the y axis of a body turned by ``yaw``: straight down at angle
-    0, level along +y at pi / 2 and along -y at -pi / 2. Its fingers open in the vertical plane through that axis."""
+    """Returns the quaternion (4,) of a gripper that comes along the y axis of a body turned by ``yaw``.
+
+    It points straight down at angle 0, level along +y at pi / 2 and along -y at -pi / 2. Its fingers open in the
+    vertical plane through that axis.
+    """
     lean = rotations.quaternion_from_axis_angle(jnp.array([1.0, 0.0, 0.0]), jnp.asarray(angle, jnp.float32))
     turn = rotations.quaternion_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(yaw, jnp.float32))
     return rotations.quaternion_multiply(turn, rotations.quaternion_multiply(lean, rotations.DOWN))
