@@ -41,7 +41,7 @@ class MeshConfig:
             raise UserError(f"mesh: expected positive sizes, and -1 (the rest) for one axis at most; got {named}")
 
     def shape(self, devices: int) -> tuple[int, int, int]:
-        """Sizes of the axes on so many devices. Raises UserError where they do not multiply to it."""
+        """Returns the sizes of the axes on these devices. Raises UserError unless their product is the number of devices."""
         sizes = [self.data, self.fsdp, self.tensor]
         named = ", ".join(f"{axis}={size}" for axis, size in zip(MESH_AXES, sizes, strict=True))
         known = math.prod(size for size in sizes if size != -1)
@@ -168,7 +168,7 @@ class Experiment:
 
     @property
     def keypoints(self) -> Literal["oracle", "segmentation"]:
-        """What a policy of this experiment is told to go near in simulation, because it learned from the same."""
+        """Where a policy of this experiment gets its keypoints in simulation: from where it learned them."""
         return self.data.keypoints if self.encoding.use_keypoints else "oracle"
 
     def __post_init__(self) -> None:

@@ -226,7 +226,7 @@ class RunCheckpoints:
             whole = f"the checkpoint of step {steps[-1]} is whole" if steps else "there is no earlier one"
             raise CheckpointError(
                 f"{self.folder}: a checkpoint could not be written ({str(error).splitlines()[0][:300]}); {whole}. "
-                "Free space, or make the folder writable, and give the same command again: it goes on from there"
+                "Free space, or make the folder writable, and give the same command again to resume"
             ) from error
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The keypoint constraint in time: which object point an arm is told to go near.
+"""The keypoint constraint in time: which object point is given to an arm.
 
 An arm has K keypoints in the order the instruction names them. The active one is the first it has not yet come within
 5 cm of; it never goes back, and the last one stays active for good. Arms with fewer than K keypoints repeat their last.

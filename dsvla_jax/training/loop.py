@@ -34,7 +34,7 @@ class Batches(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class PeriodicEval:
-    """What is measured of a state every so many steps, and at the end."""
+    """What is measured of a state at an interval of steps, and at the end."""
 
     name: str
     """For people, such as "validating"."""

@@ -107,7 +107,7 @@ DATASETS = (
         ),
         notes=(
             "the gripper's state is 1 when closed (https://huggingface.co/datasets/robot-lev/fmb_multi, and"
-            " thu-ml/RoboticsDiffusionTransformer); which way its action goes is not told: the next state is the"
+            " thu-ml/RoboticsDiffusionTransformer); which way its action goes is not recorded: the next state is the"
             " command",
             "only reached poses are known to be metric",
             "depth comes without a camera",

@@ -23,7 +23,7 @@ DATASETS = (
         ArmColumns(gripper=opening(6), action=Delta(Read("action", 0, 3), "none")),
         metric=False,
         notes=(
-            "no robot state; the units of actions are not told",
+            "no robot state; the units of actions are not recorded",
             "the angles are differences of z-y-z angles (russellmendonca/rlds_dataset_builder), from which no rotation"
             " can be told: they are left out",
             "the last column is a flag",

@@ -30,7 +30,7 @@ DATASETS = (
         (ArmColumns(gripper=Openness(CLOSING_ACTION, 1, 0), action=moved()),),
         LANGUAGE,
         metric=False,
-        notes=("no robot state; the units of actions are not told",),
+        notes=("no robot state; the units of actions are not recorded",),
     ),
     converted(
         f"stanford_kuka_multimodal_dataset{SUFFIX}",
@@ -53,7 +53,10 @@ DATASETS = (
             action=Delta(Read("action", 0, 6), "rpy"),
         ),
         bgr=EXCHANGED_VIEWS,
-        notes=("which of three gripper columns is the opening is not told: the last command stands for it", EXCHANGED),
+        notes=(
+            "which of three gripper columns is the opening is not recorded: the last command stands for it",
+            EXCHANGED,
+        ),
     ),
     converted(
         f"stanford_mask_vit{SUFFIX}",

@@ -18,7 +18,7 @@ def _pr2(name: str) -> OxeDataset:
     measured = Openness(Read("observation/state", 6, 7), 0, 86)
     notes = (
         "positions and the gripper's width are millimetres, as thu-ml/RoboticsDiffusionTransformer reads them",
-        "which way the gripper's action goes is not told: the opening of the next step is the command",
+        "which way the gripper's action goes is not recorded: the opening of the next step is the command",
     )
     return reached(name, 10, "rpy", gripper=Following(measured), gripper_state=measured, scale=1e-3, notes=notes)
 

@@ -13,6 +13,6 @@ DATASETS = (
         (ArmColumns(gripper=Openness(Read("action/open_gripper"), 0, 1), action=moved()),),
         LANGUAGE,
         metric=False,
-        notes=("the state is joints only; the units of actions are not told",),
+        notes=("the state is joints only; the units of actions are not recorded",),
     ),
 )

@@ -14,6 +14,6 @@ DATASETS = (
             pose=Pose(Read("observation/state"), "matrix"),
             action=Delta(Read("action"), "none"),
         ),
-        notes=("octo and openvla report the data broken", "no gripper is told: always closed"),
+        notes=("octo and openvla report the data broken", "no gripper is recorded: always closed"),
     ),
 )
