@@ -41,7 +41,7 @@ class MeshConfig:
             raise UserError(f"mesh: expected positive sizes, and -1 (the rest) for one axis at most; got {named}")
 
     def shape(self, devices: int) -> tuple[int, int, int]:
-        """Returns the sizes of the axes on these devices. Raises UserError unless their product is the number of devices."""
+        """Returns the sizes of the axes on these devices. Raises UserError unless their product is `devices`."""
         sizes = [self.data, self.fsdp, self.tensor]
         named = ", ".join(f"{axis}={size}" for axis, size in zip(MESH_AXES, sizes, strict=True))
         known = math.prod(size for size in sizes if size != -1)
