@@ -49,10 +49,14 @@ FIGURES = {
     "paper_7b_train": (
         *(f"batch 2/{name}" for name in ("seconds", "compile_seconds", "tokens_per_second", "examples_per_second")),
         *(f"batch 2/{name}" for name in ("tflops", "planned_gib", "held_gib", "peak_gib", "loss")),
+        "batch 2, remat dots/seconds",
         "parameters",
         "weights/seconds",
     ),
-    "paper_7b_decode": tuple(f"robots 2/{name}" for name in ("milliseconds", "compile_seconds", "repeats")),
+    "paper_7b_decode": (
+        *(f"robots 2/{name}" for name in ("milliseconds", "compile_seconds", "repeats")),
+        "robots 2, int8/milliseconds",
+    ),
     "points": ("clouds 2/clouds_per_second", "clouds 2/sampling/seconds", "clouds 2/tokenizer/seconds"),
     "render": ("lamp_on 16 px/frames_per_second",),
     "equal_pictures": ("sha256_cpu", "equal_pixels_share", "largest_colour_difference", "largest_depth_difference"),

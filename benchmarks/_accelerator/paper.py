@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks._accelerator.device import gib
-from benchmarks._accelerator.sections import Job, Size
+from benchmarks._accelerator.sections import DecodeCase, Job, Size, TrainCase
 from benchmarks._timing import Timing, timed
 from configs import get_config
 from data_pipelines.records import Frame
@@ -28,6 +28,7 @@ from dsvla_jax.experiment import Experiment
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, VisionConfig, VisualPromptConfig
 from dsvla_jax.model.partition import shardings
+from dsvla_jax.model.quantize import quantize
 from dsvla_jax.model.variables import join_variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.planning import held_bytes, peak_bytes
@@ -168,18 +169,20 @@ def train(job: Job) -> None:
     shared = make_weights(job)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     targets = number_rows(tokenizer, experiment.encoding.style).targets(experiment.soft_target_sigma)
-    for size in job.sizes.train_batches:
-        if job.sizes.name == "full" and size != job.sizes.train_batches[0] and job.left() < ANOTHER:
-            job.note(**{f"batch {size}": {"skipped": f"{job.left():.0f} s were left"}})
+    for number, case in enumerate(job.sizes.train):
+        if number and too_late(job, case.name):
             continue
-        one = dataclasses.replace(experiment, batch_size=size)
+        size, one = case.batch, train_experiment(experiment, case)
         batch = put_batch(train_batch(one, tokenizer, size), mesh)
         step = jit_train_step(make_train_step(one, VLA(one.model), optimizer, targets), shared["state"], mesh)
         start = time.perf_counter()
         lowered = step.lower(shared["state"], shared["frozen"], batch)
         traced = time.perf_counter() - start
         compiled = lowered.compile()
-        compile_seconds = time.perf_counter() - start - traced
+        compile_seconds, planned = time.perf_counter() - start - traced, peak_bytes(compiled) / 2**30
+        if (room := gib("bytes_limit")) and planned > room:
+            job.note(**{case.name: {"skipped": f"planned {planned:.1f} GiB, there are {room:.1f}"}})
+            continue
 
         def once(compiled: Any = compiled, batch: Any = batch) -> Any:
             # The state is consumed, so there is none until the step is done.
@@ -198,13 +201,28 @@ def train(job: Job) -> None:
             "positions_per_second": positions / timing.median,
             "tflops": flops / timing.median / 1e12,
             "utilisation": flops / timing.median / peak if peak else 0.0,
-            "planned_gib": peak_bytes(compiled) / 2**30,
+            "planned_gib": planned,
             "held_gib": held_bytes(one, mesh) / 2**30,
             "peak_gib": gib(_PEAK),
             "loss": float(metrics["loss"]),
             "skipped_steps": int(metrics["skipped_steps"]),
         }
-        job.note(**{f"batch {size}": figures})
+        job.note(**{case.name: figures})
+
+
+def train_experiment(experiment: Experiment, case: TrainCase) -> Experiment:
+    """The config with what the case changes."""
+    changes = {name: value for name in ("remat", "attention") if (value := getattr(case, name))}
+    model = dataclasses.replace(experiment.model, **changes)
+    return dataclasses.replace(experiment, batch_size=case.batch, model=model)
+
+
+def too_late(job: Job, name: str) -> bool:
+    """Whether too little time is left for another case, which the report then says."""
+    if job.sizes.name != "full" or job.left() > ANOTHER:
+        return False
+    job.note(**{name: {"skipped": f"{job.left():.0f} s were left"}})
+    return True
 
 
 def decode(job: Job) -> None:
@@ -214,25 +232,42 @@ def decode(job: Job) -> None:
     state, frozen = shared.pop("state"), shared.pop("frozen")
     variables = join_variables(state.trainable, frozen)
     del state, frozen
-    policy = Policy(PolicyConfig(experiment.encoding, experiment.model), variables, tokenizer)
-    for robots in job.sizes.robots:
-        if job.sizes.name == "full" and robots != job.sizes.robots[0] and job.left() < ANOTHER:
-            job.note(**{f"robots {robots}": {"skipped": f"{job.left():.0f} s were left"}})
+    base = "bfloat16"
+    for number, case in enumerate(job.sizes.decode):
+        if number and too_late(job, case.name):
             continue
+        if case.base != base:
+            variables, base = {**variables, "params": jax.jit(quantize, donate_argnums=0)(variables["params"])}, "int8"
+        policy, robots = Policy(policy_config(experiment, case), variables, tokenizer), case.robots
         asked = frames(experiment, robots)
         seen = [(Observation(one.picture, one.robot), one.keypoint) for one in asked]
         observation, keypoints = jax.tree.map(lambda *leaves: np.stack(leaves), *seen)
         observation = jax.tree.map(jnp.asarray, observation)
         instructions = [one.instruction for one in asked]
-        decision, timing = timed(
-            lambda observation=observation, instructions=instructions, keypoints=keypoints: (
-                policy.decide(observation, instructions, keypoints).action
-            ),
-            job.sizes.actions,
-        )
-        job.note(**{f"robots {robots}": decode_figures(experiment, robots, timing)})
-        assert np.isfinite(np.asarray(decision.pose)).all()
+
+        def act(policy: Policy = policy, asked: Any = (observation, instructions, keypoints)) -> Action[np.ndarray]:
+            return policy.decide(*asked).action
+
+        try:
+            action, timing = timed(act, job.sizes.actions)
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            job.note(**{case.name: {"skipped": "too little memory"}})
+            continue
+        assert np.isfinite(np.asarray(action.pose)).all()
+        job.note(**{case.name: decode_figures(experiment, robots, timing)})
     job.note(peak_gib=gib(_PEAK))
+
+
+def policy_config(experiment: Experiment, case: DecodeCase) -> PolicyConfig:
+    """What the case's policy is."""
+    model = experiment.model
+    if case.base == "int8":
+        model = dataclasses.replace(model, base_dtype="int8")
+    if case.attention:
+        model = dataclasses.replace(model, attention=case.attention)
+    return PolicyConfig(experiment.encoding, model)
 
 
 def decode_figures(experiment: Experiment, robots: int, timing: Timing) -> dict[str, float]:

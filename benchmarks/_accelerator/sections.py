@@ -13,15 +13,51 @@ Size = Literal["full", "toy"]
 
 
 @dataclasses.dataclass(frozen=True)
+class TrainCase:
+    """One training step that is measured; what is None is as `configs/paper_7b.py` has it."""
+
+    batch: int
+    remat: Literal["full", "dots"] | None = None
+    attention: Literal["fused", "cudnn"] | None = None
+
+    @property
+    def name(self) -> str:
+        """What the report calls it."""
+        changes = [f"{field} {value}" for field in ("remat", "attention") if (value := getattr(self, field))]
+        return ", ".join((f"batch {self.batch}", *changes))
+
+
+@dataclasses.dataclass(frozen=True)
+class DecodeCase:
+    """Actions that are measured: of so many robots, with the base in bfloat16 or in 8 bits."""
+
+    robots: int
+    base: Literal["bfloat16", "int8"] = "bfloat16"
+    attention: Literal["fused", "cudnn"] | None = None
+
+    @property
+    def name(self) -> str:
+        """What the report calls it."""
+        changes = [self.base] if self.base != "bfloat16" else []
+        changes += [f"attention {self.attention}"] if self.attention else []
+        return ", ".join((f"robots {self.robots}", *changes))
+
+
+@dataclasses.dataclass(frozen=True)
 class Sizes:
     """How much of everything is measured."""
 
     name: Size = "full"
     product: int = 8192
     """Rows and columns of the matrices whose product gives the device's attainable rate."""
-    train_batches: tuple[int, ...] = (3, 16)
+    train: tuple[TrainCase, ...] = (
+        TrainCase(3),
+        TrainCase(16, "dots", "cudnn"),
+        TrainCase(16, "dots"),
+        TrainCase(16),
+    )
     train_steps: int = 10
-    robots: tuple[int, ...] = (1, 16)
+    decode: tuple[DecodeCase, ...] = (DecodeCase(1), DecodeCase(8), DecodeCase(1, "int8"), DecodeCase(64, "int8"))
     actions: int = 20
     episodes: tuple[int, ...] = (32, 256, 1024)
     """Side by side in the device loop."""
@@ -53,9 +89,9 @@ SIZES = {
     "toy": Sizes(
         name="toy",
         product=64,
-        train_batches=(2,),
+        train=(TrainCase(2), TrainCase(2, "dots")),
         train_steps=2,
-        robots=(2,),
+        decode=(DecodeCase(2), DecodeCase(2, "int8")),
         actions=2,
         episodes=(2,),
         keyframes=2,
