@@ -40,7 +40,7 @@ from dsvla_jax.experiment import Experiment, load_experiment, require_simulated
 from dsvla_jax.files import write_picture
 from dsvla_jax.model.decode import Decoding
 from dsvla_jax.perception.simulator import Keypoints, keypoint_source
-from dsvla_jax.policy import Policy
+from dsvla_jax.policies.interface import Policy
 from dsvla_jax.ranges import at_least, check_fields, require
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.shifts import check_shifts

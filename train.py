@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
-import numpy as np
 import tyro
 
 from configs import config_names, get_config
@@ -29,15 +28,15 @@ from data_pipelines.training_data import open_training_data, open_validation_dat
 from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.checkpoints.storage import require_writable_path
 from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_memory, parse_options
-from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.evaluation.while_training import measure_success
 from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.variables import join_variables
-from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.preflight import check_step
-from dsvla_jax.policy import Policy, PolicyConfig, save_policy_config
+from dsvla_jax.policies.config import PolicyConfig, uses_model
+from dsvla_jax.policies.registry import make_learner, make_policy
+from dsvla_jax.policy import save_policy_config
 from dsvla_jax.ranges import require
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.tasks import TASKS
@@ -52,7 +51,6 @@ from dsvla_jax.training.sharding import BatchPart, batch_part, make_mesh, put_ba
 from dsvla_jax.training.signals import EXIT_STATUS
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
 from dsvla_jax.training.validation import jit_validation, mean_errors
-from dsvla_jax.types import Example
 from dsvla_jax.weights.backbones import require_base
 from dsvla_jax.weights.base_variables import base_variables
 
@@ -67,7 +65,8 @@ def prepare(
     one another, the vocabulary, the base, the pictures, or what the run folder holds.
     """
     require_writable_path(run)
-    tokenizer = tokenizer_of(experiment.tokenizer, experiment.model.language.vocab_size)
+    rows = experiment.model.language.vocab_size if uses_model(experiment.baseline) else None
+    tokenizer = tokenizer_of(experiment.tokenizer, rows)
     if experiment.oxe is None:
         tasks = choose_tasks(experiment.data)
         experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
@@ -80,7 +79,9 @@ def prepare(
     if experiment.oxe is not None:
         picture = require_oxe_fits(experiment.oxe, experiment.encoding, tokenizer)
     else:
-        picture = require_data_fits(experiment.data, experiment.encoding, tokenizer, held_out)
+        picture = require_data_fits(
+            experiment.data, experiment.encoding, tokenizer, held_out, instructions_only=experiment.baseline is not None
+        )
     experiment = with_workspace(experiment, run, tokenizer)
     require_same_experiment(run, experiment)
     return experiment, tokenizer, mesh, part, picture
@@ -136,13 +137,27 @@ def train(
     data = open_training_data(experiment, tokenizer, part)
     held_out = open_validation_data(experiment, tokenizer, part)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    start = partial(initial_state, experiment, tokenizer.number_values, optimizer)
+    learner = make_learner(
+        experiment.baseline, experiment.encoding, experiment.model, tokenizer, experiment.soft_target_sigma
+    )
+    average = experiment.optimizer.average_decay
+    start = partial(
+        initial_state,
+        learner,
+        optimizer,
+        experiment.seed,
+        experiment.regime,
+        experiment.model.frozen_dtype,
+        average > 0,
+    )
     base = base_variables(experiment.base, experiment.model, tokenizer, experiment.regime != "full", mesh)
     state, frozen = make_sharded(start, mesh, base)
     report_size(state.trainable, frozen, data.samples)
 
     save_experiment(run / "config.json", experiment)
-    config = PolicyConfig(experiment.encoding, experiment.model, data.displacement, data.learned_from)
+    config = PolicyConfig(
+        experiment.encoding, experiment.model, data.displacement, data.learned_from, baseline=experiment.baseline
+    )
     save_policy_config(run, config, tokenizer)
     if checkpoints.latest_step is not None:
         frozen = checkpoints.restore_base(frozen)
@@ -153,23 +168,23 @@ def train(
     else:
         checkpoints.save_base(frozen)
 
-    targets = number_rows(tokenizer, experiment.encoding.style).targets(experiment.soft_target_sigma)
-    compiled = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, targets), state, mesh)
+    train_step = make_train_step(learner, optimizer, experiment.gradient_accumulation, average)
+    compiled = jit_train_step(train_step, state, mesh)
 
-    def step(state: TrainState, batch: Example[np.ndarray]) -> tuple[TrainState, dict[str, Any]]:
+    def step(state: TrainState, batch: Any) -> tuple[TrainState, dict[str, Any]]:
         return compiled(state, frozen, put_batch(batch, mesh))
 
-    sums = jit_validation(experiment, targets, mesh)
+    sums = jit_validation(learner, mesh)
 
     def validate(state: TrainState, _: Callable[[], bool]) -> dict[str, float]:
-        return mean_errors(sums, state.trainable, frozen, held_out(), mesh)
+        return mean_errors(sums, state.acting, frozen, held_out(), mesh)
 
     @cache
     def environments() -> dict[str, Environment]:
         return {name: Environment(name, image_size=experiment.data.image_size) for name in experiment.data.tasks}
 
     def evaluate(state: TrainState, stop: Callable[[], bool]) -> dict[str, float]:
-        policy = Policy(config, join_variables(state.trainable, frozen), tokenizer)
+        policy = make_policy(config, join_variables(state.acting, frozen), tokenizer)
         episodes = experiment.evaluation.episodes_while_training
         return measure_success(policy.act, environments(), experiment.keypoints, episodes, experiment.data.seed, stop)
 
@@ -189,6 +204,7 @@ def train(
             batches=data.batches,
             checkpoints=checkpoints,
             metrics=metrics,
+            learner=learner,
             checks=checks,
             note=watchdog.doing,
         )

@@ -12,6 +12,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
@@ -19,13 +20,12 @@ import tyro
 import dsvla_jax.policy
 from benchmarks._timing import timed
 from dsvla_jax.command_line import configure_jax, fail_with_message
-from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.evaluation.device_loop import DeviceLoop, Rollout
 from dsvla_jax.evaluation.loop import run_episodes
 from dsvla_jax.evaluation.outcome import EpisodeOutcome
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.perception.simulator import Keypoints, keypoint_source
-from dsvla_jax.policy import Policy
+from dsvla_jax.policies.interface import DevicePolicy
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
@@ -43,14 +43,14 @@ class Options:
     batches: tuple[int, ...] = (4, 16)
 
 
-def agreeing(policy: Policy, endings: list[EpisodeOutcome], rollout: Rollout) -> int:
+def agreeing(policy: DevicePolicy, endings: list[EpisodeOutcome], rollout: Rollout) -> int:
     """Episodes that are the same in both."""
-    integers, keyframes = np.asarray(rollout.integers), np.asarray(rollout.keyframes)
-    succeeded, style = np.asarray(rollout.state.verdict.succeeded), policy.config.encoding.style
+    keyframes, succeeded = np.asarray(rollout.keyframes), np.asarray(rollout.state.verdict.succeeded)
+    texts = [policy.texts(jax.tree.map(lambda x, k=k: x[k], rollout.answers)) for k in range(int(keyframes.max()))]
     return sum(
         ending.success == succeeded[i]
         and ending.keyframes == keyframes[i]
-        and ending.answers == [format_answer(integers[k, i], style) for k in range(keyframes[i])]
+        and ending.answers == [texts[k][i] for k in range(keyframes[i])]
         for i, ending in enumerate(endings)
     )
 
@@ -67,6 +67,7 @@ def main(options: Options) -> int:
     for task in options.tasks:
         environment = Environment(task, "mjx", image_size=experiment.data.image_size)
         on_device = DeviceLoop(environment, policy)
+        asked = policy.on_device(environment.num_arms, environment.task.all_instructions())
         for batch in options.batches:
             state = environment.reset(episode_keys(0, "eval", task, 0, batch))
             keypoints = first_keypoints(environment, state, experiment.keypoints)
@@ -75,7 +76,7 @@ def main(options: Options) -> int:
             endings, host_times = timed(from_host, REPEATS)
             rollout, device_times = timed(partial(on_device.rollout, state, keypoints), REPEATS)
             device, host = min(device_times.later), min(host_times.later)
-            same = agreeing(policy, endings, rollout)
+            same = agreeing(asked, endings, rollout)
             different += batch - same
             print(
                 f"{task} x {batch}: {same} of {batch} episodes agree, {sum(e.success for e in endings)} succeed; "

@@ -21,13 +21,14 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from configs.paper_7b import config as paper_7b
 from dsvla_jax.command_line import fail_with_message
-from dsvla_jax.encoding.prompt_table import instruction_tokens
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.evaluation.device_loop import device_loop
 from dsvla_jax.experiment import MeshConfig
+from dsvla_jax.model.decode import GREEDY
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policy import PolicyConfig
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.three_ds_vla import TextOnDevice
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.training.chips import find_slice
 from dsvla_jax.training.sharding import make_mesh
@@ -62,11 +63,11 @@ def main(options: Options) -> int:
     model = dataclasses.replace(experiment.model, remat="none", attention="fused")
     environment = Environment(options.task, "mjx", image_size=experiment.data.image_size)
     tokenizer = words(model.language.vocab_size, environment.task.all_instructions())
-    policy = PolicyConfig(experiment.encoding, model)
+    config = PolicyConfig(experiment.encoding, model)
     said = [environment.task.say(0)] * options.episodes
-    beginnings, lengths = instruction_tokens(tokenizer, policy.encoding, environment.num_arms, said)
-    limit = 2 * environment.expert_keyframes
-    loop = device_loop(environment, policy, tokenizer, limit, beginnings.shape[1])
+    policy = TextOnDevice(config, tokenizer, GREEDY, environment.num_arms, tuple(environment.task.all_instructions()))
+    question = policy.ask(said)
+    loop = device_loop(environment, policy, 2 * environment.expert_keyframes)
 
     variables = jax.eval_shape(lambda: initialize(model, jax.random.key(0)))
     variables = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.bfloat16), variables)
@@ -85,7 +86,7 @@ def main(options: Options) -> int:
         placed(variables, shardings(variables, mesh)),
         placed(state, spread),
         placed(jax.eval_shape(environment.keypoints, state), spread),
-        *(placed(jax.ShapeDtypeStruct(x.shape, x.dtype), spread) for x in (beginnings, lengths)),
+        placed(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), question), spread),
     )
     start = time.perf_counter()
     with jax.set_mesh(mesh):

@@ -45,6 +45,7 @@ def shift_world(frame: Frame, offset: np.ndarray) -> Frame:
         picture=replace(frame.picture, camera=camera),
         robot=replace(frame.robot, pose=_move(frame.robot.pose, offset)),
         target=replace(frame.target, pose=_move(frame.target.pose, offset)),
+        later=frame.later and replace(frame.later, pose=_move(frame.later.pose, offset)),
         keypoint=frame.keypoint + offset,
     )
 
@@ -118,5 +119,5 @@ def vary_colour(frame: Frame, rng: np.random.Generator, strength: float = 0.15) 
 
 def _move(poses: np.ndarray, offset: np.ndarray) -> np.ndarray:
     moved = poses.copy()
-    moved[:, :3] += offset
+    moved[..., :3] += offset
     return moved

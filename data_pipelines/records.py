@@ -85,6 +85,8 @@ class Frame:
     """The episode's number in the reader's order."""
     frame: int
     """The frame's number in its episode."""
+    later: Action[np.ndarray] | None = None
+    """The keyframes behind the next one, (R, A, 7), R of 0 or more; None where nobody knows them."""
 
 
 def encode_rgb(rgb: np.ndarray) -> bytes:
@@ -281,4 +283,5 @@ def decode_frame(episode: Episode, place: int, task_index: int = 0, episode_numb
         task_index=task_index,
         episode=episode_number,
         frame=place,
+        later=Action(episode.target_pose[place + 1 :].copy(), episode.target_gripper[place + 1 :].copy()),
     )

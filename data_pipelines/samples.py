@@ -19,6 +19,27 @@ from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.types import Example, HeldOutExample, RobotState
 
 
+def vary(frame: Frame, rng: np.random.Generator, data: DataConfig) -> Frame:
+    """The frame, varied as `data` says."""
+    if data.shift_world > 0:
+        # Horizontal only: the table, and with it the crop of the cloud, keeps its height.
+        frame = shift_world(frame, random_offset(rng, (data.shift_world, data.shift_world, 0.0)))
+    if data.crop < 1:
+        frame = random_crop(frame, rng, data.crop)
+    if data.colour_variation > 0:
+        frame = vary_colour(frame, rng, data.colour_variation)
+    if data.state_jitter > 0:
+        frame = jitter_state(frame, rng, data.state_jitter, 0.5)
+    if data.keypoint_noise > 0:
+        frame = perturb_keypoint(frame, rng, data.keypoint_noise, data.keypoint_noise_probability)
+    return frame
+
+
+def without_variation(data: DataConfig) -> DataConfig:
+    """The same data as they were recorded."""
+    return dataclasses.replace(data, shift_world=0, crop=1, colour_variation=0, state_jitter=0, keypoint_noise=0)
+
+
 def make_sampler(
     data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer
 ) -> Callable[[Frame, np.random.Generator], Example[np.ndarray]]:
@@ -30,17 +51,7 @@ def make_sampler(
     codec = encoding.codec
 
     def sample(frame: Frame, rng: np.random.Generator) -> Example[np.ndarray]:
-        if data.shift_world > 0:
-            # Horizontal only: the table, and with it the crop of the cloud, keeps its height.
-            frame = shift_world(frame, random_offset(rng, (data.shift_world, data.shift_world, 0.0)))
-        if data.crop < 1:
-            frame = random_crop(frame, rng, data.crop)
-        if data.colour_variation > 0:
-            frame = vary_colour(frame, rng, data.colour_variation)
-        if data.state_jitter > 0:
-            frame = jitter_state(frame, rng, data.state_jitter, 0.5)
-        if data.keypoint_noise > 0:
-            frame = perturb_keypoint(frame, rng, data.keypoint_noise, data.keypoint_noise_probability)
+        frame = vary(frame, rng, data)
         prompt = build_prompt(
             encoding,
             frame.instruction,
@@ -75,11 +86,7 @@ def make_validation_sampler(
     data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer
 ) -> Callable[[Frame, np.random.Generator], HeldOutExample[np.ndarray]]:
     """Returns `sample(frame, rng)` for validation: as `make_sampler`, of frames as they were recorded."""
-    plain = make_sampler(
-        dataclasses.replace(data, shift_world=0, crop=1, colour_variation=0, state_jitter=0, keypoint_noise=0),
-        encoding,
-        tokenizer,
-    )
+    plain = make_sampler(without_variation(data), encoding, tokenizer)
     numbers = number_rows(tokenizer, encoding.style)
 
     def sample(frame: Frame, rng: np.random.Generator) -> HeldOutExample[np.ndarray]:

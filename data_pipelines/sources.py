@@ -9,6 +9,7 @@ from data_pipelines.episodes import EpisodeReader
 from data_pipelines.samples import require_texts_fit
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.pose_inputs import encode_instruction
 from dsvla_jax.encoding.text import Tokenizer, check_words, unknown_words
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.tasks import TASKS, select_tasks
@@ -69,12 +70,16 @@ def open_held_out(data: DataConfig, tokenizer: Tokenizer, episodes: int) -> Epis
 
 
 def require_data_fits(
-    data: DataConfig, encoding: EncodingConfig, tokenizer: Tokenizer, held_out: int = 0
+    data: DataConfig,
+    encoding: EncodingConfig,
+    tokenizer: Tokenizer,
+    held_out: int = 0,
+    instructions_only: bool = False,
 ) -> tuple[int, int]:
     """Height and width of the pictures of ``data``. Raises UserError where they, or the texts, do not fit the encoding.
 
     Demonstrations of the simulator are judged by what they will be: nothing is made. held_out: as `open_held_out`'s
-    ``episodes``, 0 for none.
+    ``episodes``, 0 for none. instructions_only: for policies that read and write no numbers as text.
     """
     if data.source == "simulator":
         picture, name = (data.image_size, data.image_size), "data.image_size"
@@ -93,7 +98,11 @@ def require_data_fits(
         picture = (height, width)
         texts = [(text, min(reader.num_arms.values())) for text in reader.instructions]
     encoding.require_points(*picture, f"a picture of {name}")
-    require_texts_fit(encoding, tokenizer, texts)
+    if instructions_only:
+        for text, _ in texts:
+            encode_instruction(tokenizer, text, encoding.max_text_length)
+    else:
+        require_texts_fit(encoding, tokenizer, texts)
     return picture
 
 

@@ -4,24 +4,26 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypedDict
+from typing import TypedDict, TypeVar
 
 import numpy as np
 
 from data_pipelines.first_look import fit_workspace, look_at_demonstrations, look_at_mixture
 from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.loader import make_loader
-from data_pipelines.samples import make_sampler, make_validation_sampler
+from data_pipelines.pose_samples import make_pose_sampler
+from data_pipelines.records import Frame
+from data_pipelines.samples import make_sampler, make_validation_sampler, without_variation
 from data_pipelines.sources import open_demonstrations, open_held_out
 from dsvla_jax.checkpoints.steps import has_checkpoints
-from dsvla_jax.data_config import LearnedFrom
+from dsvla_jax.data_config import DataConfig, LearnedFrom
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.experiment import Experiment, load_experiment
 from dsvla_jax.training.distributed import first_process_first
 from dsvla_jax.training.loop import Batches
 from dsvla_jax.training.sharding import BatchPart
-from dsvla_jax.types import HeldOutExample
+from dsvla_jax.types import Example, HeldOutExample, PoseExample
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,13 +64,43 @@ def open_training_data(experiment: Experiment, tokenizer: Tokenizer, part: Batch
     with first_process_first("demonstrations"):
         reader = open_demonstrations(experiment.data, tokenizer)
     print(look_at_demonstrations(reader, encoding))
-    batches = make_loader(reader, make_sampler(experiment.data, encoding, tokenizer), batch_size=part.size, **order)
+    batches = make_loader(reader, training_sampler(experiment, tokenizer), batch_size=part.size, **order)
     return TrainingData(batches, reader.num_frames, None, learned_from(experiment.data, encoding.use_keypoints))
+
+
+Sample = TypeVar("Sample")
+Sampler = Callable[[Frame, np.random.Generator], Sample]
+
+
+def training_sampler(
+    experiment: Experiment, tokenizer: Tokenizer
+) -> Sampler[Example[np.ndarray]] | Sampler[PoseExample[np.ndarray]]:
+    """What makes an example of a frame, as the experiment's policy learns from it."""
+    if experiment.baseline is None:
+        return make_sampler(experiment.data, experiment.encoding, tokenizer)
+    return _pose_sampler(experiment, experiment.data, tokenizer)
+
+
+def validation_sampler(
+    experiment: Experiment, tokenizer: Tokenizer
+) -> Sampler[HeldOutExample[np.ndarray]] | Sampler[PoseExample[np.ndarray]]:
+    """What makes a validation example of a frame, as it was recorded."""
+    if experiment.baseline is None:
+        return make_validation_sampler(experiment.data, experiment.encoding, tokenizer)
+    return _pose_sampler(experiment, without_variation(experiment.data), tokenizer)
+
+
+def _pose_sampler(experiment: Experiment, data: DataConfig, tokenizer: Tokenizer) -> Sampler[PoseExample[np.ndarray]]:
+    assert experiment.baseline is not None
+    encoding = experiment.encoding
+    return make_pose_sampler(
+        data, tokenizer, encoding.max_text_length, encoding.use_keypoints, experiment.baseline.upcoming
+    )
 
 
 def open_validation_data(
     experiment: Experiment, tokenizer: Tokenizer, part: BatchPart
-) -> Callable[[], Iterator[HeldOutExample[np.ndarray]]]:
+) -> Callable[[], Iterator[HeldOutExample[np.ndarray] | PoseExample[np.ndarray]]]:
     """Opens the demonstrations held out of training.
 
     Returns a function that starts again from the first batch: this process's parts of all batches, the same each time;
@@ -78,13 +110,13 @@ def open_validation_data(
         return lambda: iter(())
     with first_process_first("held-out demonstrations"):
         reader = open_held_out(experiment.data, tokenizer, experiment.validation.episodes)
-    sample = make_validation_sampler(experiment.data, experiment.encoding, tokenizer)
+    sample = validation_sampler(experiment, tokenizer)
     # A pass forward over the part of a batch that is trained on at a time fits where training does.
     size = part.size // experiment.gradient_accumulation
     count = min(experiment.validation.batches, max(reader.num_frames // (size * part.count), 1))
     order = _order(experiment, part)
 
-    def batches() -> Iterator[HeldOutExample[np.ndarray]]:
+    def batches() -> Iterator[HeldOutExample[np.ndarray] | PoseExample[np.ndarray]]:
         return itertools.islice(make_loader(reader, sample, batch_size=size, num_threads=0, **order), count)
 
     return batches

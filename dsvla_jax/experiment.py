@@ -15,6 +15,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.partition import MESH_AXES
 from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.model.variables import Regime
+from dsvla_jax.policies.config import Baseline, uses_model
 from dsvla_jax.ranges import at_least, check_fields, more_than, require
 
 
@@ -72,6 +73,8 @@ class OptimizerConfig:
     """Decay of Adam's mean of the squared gradient."""
     gradient_clip: float = 1.0
     """Largest norm of the gradient; inf for no limit."""
+    average_decay: float = 0.0
+    """Acts by a moving average of the weights; the largest share that a step keeps of it, such as 0.999. 0 for none."""
 
     def __post_init__(self) -> None:
         check_fields(
@@ -84,6 +87,7 @@ class OptimizerConfig:
             beta1=at_least(0, below=1),
             beta2=at_least(0, below=1),
             gradient_clip=more_than(0, infinite=True),
+            average_decay=at_least(0, below=1),
         )
 
 
@@ -119,8 +123,8 @@ class Experiment:
 
     encoding: EncodingConfig
     """How an observation and a text become the network's inputs, and its answer an action."""
-    model: ModelConfig
-    """Sizes and switches of the network."""
+    model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
+    """Sizes and switches of the network; left as it is for a baseline that has a network of its own."""
     data: DataConfig = dataclasses.field(default_factory=DataConfig)
     """Simulated, imported or own demonstrations."""
     oxe: OxeConfig | None = None
@@ -131,6 +135,8 @@ class Experiment:
     """Comparison with held-out demonstrations."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """Closed-loop episodes."""
+    baseline: Baseline | None = None
+    """Another policy than 3DS-VLA, which it is compared with (docs/policies.md)."""
     regime: Regime = "full"
     """`full` trains every parameter; `lora` trains the adapters and the projection, all else stays frozen."""
     base: str = ""
@@ -189,7 +195,10 @@ class Experiment:
         )
         if self.oxe is not None:
             require(bool(self.oxe.mixture), "oxe.mixture", "a named mixture or names of datasets", self.oxe.mixture)
-        require_same_sizes(self.encoding, self.model)
+        if uses_model(self.baseline):
+            require_same_sizes(self.encoding, self.model)
+        else:
+            self._require_no_model()
         adapters = self.regime == "full" or self.model.lora is not None
         require(adapters, "regime", "'full' without adapters", repr(self.regime), "give the config a model.lora")
         require(
@@ -199,6 +208,17 @@ class Experiment:
             repr(self.model.base_dtype),
             "use regime 'lora' for frozen weights",
         )
+
+    def _require_no_model(self) -> None:
+        """Raises UserError for settings that a policy with a network of its own would ignore."""
+        for option, value, plain in (
+            ("model", self.model, ModelConfig()),
+            ("base", self.base, ""),
+            ("regime", self.regime, "full"),
+            ("soft_target_sigma", self.soft_target_sigma, 0.0),
+        ):
+            reads = f"nothing with baseline {self.baseline and self.baseline.kind!r}, which has a network of its own"
+            require(value == plain, option, reads, "other values than the default")
 
 
 # What may change when a run goes on: none of it changes what the run learns.

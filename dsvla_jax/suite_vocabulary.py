@@ -14,13 +14,14 @@ def suite_tokenizer() -> WordTokenizer:
     return WordTokenizer(vocabulary(text for task in TASKS.values() for text in task.all_instructions()))
 
 
-def tokenizer_of(folder: str, rows: int) -> Tokenizer:
+def tokenizer_of(folder: str, rows: int | None) -> Tokenizer:
     """Loads a run's vocabulary. Raises UserError if it does not fit the language model.
 
-    folder: of the vocabulary; empty for the words of the task suite. rows: of the language model's embedding.
+    folder: of the vocabulary; empty for the words of the task suite. rows: of the language model's embedding;
+    None where there is none.
     """
     tokenizer = load_tokenizer(folder) if folder else suite_tokenizer()
-    if not fits_rows(tokenizer, rows):
+    if rows is not None and not fits_rows(tokenizer, rows):
         raise UserError(
             f"tokenizer: {folder or 'the words of the task suite'} has {tokenizer.vocab_size} tokens, "
             f"model.language.vocab_size is {rows}; they must be of one language model"

@@ -8,6 +8,7 @@ An array dimension has one letter everywhere:
     p  points of a cloud                              g  3D tokens (groups); also FPS centres
     n  2D image patches                               k  neighbours, or keypoints where no cloud is near
     l  answer tokens                                  s  side of the square image the network sees, pixels
+    u  upcoming keyframes
 
 Docstrings write them in capitals. A struct holds one item or a batch: `*b` stands for any number of leading axes, the
 same for all its fields. The structs are generic in the array type: `Example[np.ndarray]` on the host,
@@ -147,6 +148,33 @@ class HeldOutExample(Generic[ArrayT]):
     """int32: the answer's; zeros for a second arm that is not there."""
     number_of: Int[ArrayT, "*b t"]
     """int32: which of the integers, counted from 1, a token belongs to; 0 for none."""
+
+
+@pytree
+class PoseInputs(Generic[ArrayT]):
+    """What a policy reads that answers with poses: all robots have two arms here, of which one may be missing."""
+
+    picture: Picture[ArrayT]
+    robot: RobotState[ArrayT]
+    """Of two arms; a missing one's is zeros."""
+    arms: Bool[ArrayT, "*b 2"]
+    """Which arms are there."""
+    words: Text[ArrayT]
+    """The instruction."""
+    keypoints: Float[ArrayT, "*b 2 3"]
+    """The active one of each arm, metres, world frame; zeros where none is known."""
+    has_keypoints: Bool[ArrayT, "*b"]
+
+
+@pytree
+class PoseExample(Generic[ArrayT]):
+    """What such a policy learns from: its inputs, and the keyframes that follow."""
+
+    inputs: PoseInputs[ArrayT]
+    pose: Float[ArrayT, "*b u 2 7"]
+    """Of the next keyframes in order, the last repeated; zeros for a missing arm."""
+    gripper_open: Float[ArrayT, "*b u 2"]
+    """0 or 1."""
 
 
 @pytree

@@ -20,7 +20,8 @@ from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import Regime, split_variables
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policy import PolicyConfig, save_policy_config
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policy import save_policy_config
 from dsvla_jax.training.sharding import make_mesh
 from tests.small import small_language, small_vision
 

@@ -13,7 +13,8 @@ from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policy import Policy, PolicyConfig
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.three_ds_vla import TextPolicy
 from dsvla_jax.serving.server import Limits, PolicyServer
 from tests.small import small_encoding, small_language, small_vision
 
@@ -21,7 +22,7 @@ SIZE = 32
 PROMPTS = ("turn on the light", "close the fridge", "lift the ball", "press the red button")
 
 
-def tiny_policy(use_keypoints: bool = True, use_points: bool = True, words: Iterable[str] = PROMPTS) -> Policy:
+def tiny_policy(use_keypoints: bool = True, use_points: bool = True, words: Iterable[str] = PROMPTS) -> TextPolicy:
     """Random weights, larger than at initialisation, so that different observations get different answers."""
     tokenizer = WordTokenizer(vocabulary(words))
     encoding = small_encoding(max_text_length=48, use_keypoints=use_keypoints, use_points=use_points)
@@ -30,7 +31,7 @@ def tiny_policy(use_keypoints: bool = True, use_points: bool = True, words: Iter
         language=small_language(tokenizer.vocab_size),
     )
     variables = jax.tree.map(lambda x: 3.0 * x, initialize(model, jax.random.key(0)))
-    return Policy(PolicyConfig(encoding, model), variables, tokenizer)
+    return TextPolicy(PolicyConfig(encoding, model), variables, tokenizer)
 
 
 def observation(seed: int, arms: int = 1, size: int = SIZE) -> dict[str, Any]:
@@ -81,7 +82,7 @@ def running(server_of: Any) -> Iterator[tuple[PolicyServer, int]]:
         thread.join(20)
 
 
-def small_server(policy: Policy | None = None, **options: Any) -> PolicyServer:
+def small_server(policy: TextPolicy | None = None, **options: Any) -> PolicyServer:
     """A server of 32 x 32 pixels, one arm and batches of at most 2."""
     limits = Limits(**{"batch": 2, "message_seconds": 1.0, **options.pop("limits", {})})
     return PolicyServer(policy or tiny_policy(), [(SIZE, SIZE)], [1], limits, **options)

@@ -26,12 +26,12 @@ from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.partition import make_sharded
-from dsvla_jax.model.vla import VLA
 from dsvla_jax.training.loop import arrays_of, state_of
 from dsvla_jax.training.sharding import batch_part, make_mesh, put_batch
-from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.training.state import jit_train_step, make_optimizer
 from dsvla_jax.training.validation import jit_validation, mean_errors
 from dsvla_jax.types import Example, HeldOutExample
+from tests.learning import learner_of, start_of, step_of
 from tests.random_data import random_example
 from tests.small import small_encoding, small_language, small_vision
 
@@ -99,8 +99,8 @@ def train(experiment: Experiment, devices: int, run: Path | None, until: int, va
     mesh = make_mesh(experiment.mesh, jax.devices()[:devices] if devices else None)
     values = np.full(VOCABULARY, np.nan, np.float32)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    state, frozen = make_sharded(partial(initial_state, experiment, values, optimizer), mesh)
-    step = jit_train_step(make_train_step(experiment, VLA(experiment.model), optimizer, TARGETS), state, mesh)
+    state, frozen = make_sharded(partial(start_of, experiment, values, optimizer), mesh)
+    step = jit_train_step(step_of(experiment, optimizer, TARGETS), state, mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     mine = slice(part.index * part.size, (part.index + 1) * part.size)
     parts = [jax.tree.map(lambda leaf: leaf[mine], batch) for batch in batches(experiment)]
@@ -124,7 +124,7 @@ def train(experiment: Experiment, devices: int, run: Path | None, until: int, va
             checkpoints.save(until, arrays_of(state), Notes(iterator={}, config={}))
         print("saved", digest((state, frozen)), flush=True)
     if validates:
-        sums = jit_validation(experiment, TARGETS, mesh)
+        sums = jit_validation(learner_of(experiment, TARGETS), mesh)
         figures = mean_errors(sums, state.trainable, frozen, map(validation_batch, parts), mesh)
         print("validation", json.dumps(figures), flush=True)
     return losses

@@ -28,16 +28,16 @@ from dsvla_jax.encoding.encode import cloud_tokens
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import front_camera
-from dsvla_jax.model.vla import VLA
 from dsvla_jax.sim.environment import Environment, step
 from dsvla_jax.sim.kinematics import track
 from dsvla_jax.sim.robot import SINGLE_BASE
 from dsvla_jax.sim.scene import build_scene
 from dsvla_jax.sim.shifts import SHIFTS, Start, shift
 from dsvla_jax.sim.tasks import get_task
-from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.training.state import jit_train_step, make_optimizer
 from dsvla_jax.types import Picture
 from tests.accelerator_sections import platforms_expert, sections
+from tests.learning import start_of, step_of
 from tests.small import small_encoding
 from tests.vocabularies import small_tokenizer
 
@@ -133,9 +133,9 @@ def test_the_largest_programs_can_be_written_for_an_nvidia_gpu():
     full = paper_experiment("full")
     full = dataclasses.replace(full, batch_size=1, model=dataclasses.replace(full.model, attention="fused"))
     tokenizer, optimizer = small_tokenizer("sentencepiece"), make_optimizer(full.optimizer, full.steps)
-    state, frozen = jax.eval_shape(partial(initial_state, full, None, optimizer))
+    state, frozen = jax.eval_shape(partial(start_of, full, None, optimizer))
     targets = number_rows(tokenizer, full.encoding.style).targets(0.0)
-    train_step = jit_train_step(make_train_step(full, VLA(full.model), optimizer, targets), state, one_device(full))
+    train_step = jit_train_step(step_of(full, optimizer, targets), state, one_device(full))
     environment, start = Environment("stack_blocks", "mjx"), starts("stack_blocks", 96, "eval", 1)
     move = jax.tree.map(lambda x: x[:, 0], environment.expert(start))
     for program, arguments in (

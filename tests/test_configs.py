@@ -13,18 +13,19 @@ import configs
 from configs import config_names, get_config
 from data_pipelines.episodes import Frame
 from data_pipelines.samples import make_sampler
-from dsvla_jax.encoding.encode import build_prompt, encode_text
+from dsvla_jax.encoding.encode import build_prompt, encode_text, model_inputs
 from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.variables import split_variables
-from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.model.vla import initialize
 from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.suite_vocabulary import suite_tokenizer
-from dsvla_jax.training.state import make_optimizer, make_train_step, model_inputs, start_state
+from dsvla_jax.training.state import make_optimizer, start_state
 from dsvla_jax.types import Action, Example, Picture, RobotState
+from tests.learning import step_of
 
 # row: (3D spatial constraint, 3D tokens, aligned positional embeddings)
 ROWS = {
@@ -84,7 +85,7 @@ def test_row_trains(name: str):
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state = start_state(trainable, optimizer, experiment.seed)
     targets = number_rows(suite_tokenizer(), experiment.encoding.style).targets(experiment.soft_target_sigma)
-    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, targets))
+    step = jax.jit(step_of(experiment, optimizer, targets))
     losses = []
     for _ in range(experiment.steps):
         state, metrics = step(state, frozen, batch)

@@ -24,6 +24,7 @@ def test_a_turn_is_described_with_its_prompt_and_probabilities():
     (arm,) = step.numbers
     assert [name for name, _, _ in arm] == list(NUMBERS)
     assert " ".join(value for _, value, _ in arm) == step.answer
+    assert decision.log_probs is not None
     np.testing.assert_allclose([p for _, _, p in arm], np.exp(decision.log_probs[0, 0]), rtol=1e-6)
     for uri in (step.tokens, step.target):
         encoded = base64.b64decode(uri.removeprefix("data:image/png;base64,"))

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 
@@ -9,15 +10,29 @@ from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.evaluation.device_loop import DeviceLoop
 from dsvla_jax.evaluation.loop import run_episodes
 from dsvla_jax.perception.simulator import SegmentationKeypoints
+from dsvla_jax.policies.config import Baseline, BehaviourCloningConfig
+from dsvla_jax.policies.interface import Policy
+from dsvla_jax.policies.registry import make_learner, make_policy
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from tests.serving import SIZE, tiny_policy
 
 
+def random_policy(baseline: Baseline, words: list[str]) -> Policy:
+    """A policy that answers with poses, with random weights, beside `tiny_policy`."""
+    plain = tiny_policy(words=words)
+    config = dataclasses.replace(plain.config, baseline=baseline)
+    learner = make_learner(baseline, config.encoding, config.model, plain.tokenizer)
+    variables = jax.tree.map(lambda x: x + 0.05, learner.initialise(jax.random.key(0)))
+    return make_policy(config, variables, plain.tokenizer)
+
+
 @pytest.mark.slow
-def test_both_loops_give_the_same_episodes():
+@pytest.mark.parametrize("kind", ["text", "poses"])
+def test_both_loops_give_the_same_episodes(kind: str):
     environment = Environment("lamp_on", "mjx", image_size=SIZE)
-    policy = tiny_policy(words=environment.task.all_instructions())
+    words = environment.task.all_instructions()
+    policy = tiny_policy(words=words) if kind == "text" else random_policy(BehaviourCloningConfig(), words)
     state = environment.reset(episode_keys(0, "validation", "lamp_on", 0, 3))
     source = SegmentationKeypoints(environment, state)
     found, problems = source(state, environment.observe(state))

@@ -17,7 +17,8 @@ from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.evaluation.results import read_results
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.training.loop import arrays_of, state_of
-from dsvla_jax.training.state import initial_state, make_optimizer
+from dsvla_jax.training.state import make_optimizer
+from tests.learning import start_of
 
 RUN = Path(__file__).parent / "golden" / "run"
 
@@ -35,7 +36,7 @@ def test_a_run_of_an_earlier_version_evaluates_to_the_same_outcomes(tmp_path: Pa
 def test_training_state_of_an_earlier_version_is_restored():
     experiment = load_experiment(RUN / "config.json")
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    like, _ = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+    like, _ = jax.eval_shape(partial(start_of, experiment, None, optimizer))
     like = jax.tree.map(lambda leaf: leaf.update(sharding=jax.sharding.SingleDeviceSharding(jax.devices()[0])), like)
     with closing(RunCheckpoints(RUN, read_only=True)) as checkpoints:
         restored = checkpoints.restore(arrays_of(like))

@@ -22,7 +22,8 @@ from dsvla_jax.evaluation.results import EpisodeResult, read_results, write_resu
 from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policy import PolicyConfig, save_policy_config
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policy import save_policy_config
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from tests.run_folders import NO_NOTES, variables_only

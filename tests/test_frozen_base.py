@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dsvla_jax.checkpoints.storage import CheckpointError
+from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, MeshConfig
@@ -22,9 +23,10 @@ from dsvla_jax.model.quantize import dequantize, quantize, quantize_kernel
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.sharding import make_mesh
-from dsvla_jax.training.state import initial_state, make_optimizer, make_train_step, model_inputs
+from dsvla_jax.training.state import make_optimizer
 from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
 from dsvla_jax.weights.base_variables import base_variables
+from tests.learning import start_of, step_of
 from tests.run_folders import write_run
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
 
@@ -53,7 +55,7 @@ def start(experiment: Experiment):
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
 
     def make(base):
-        return initial_state(experiment, values, optimizer, base)
+        return start_of(experiment, values, optimizer, base)
 
     return make_sharded(make, mesh, base_of(experiment, mesh))
 
@@ -211,8 +213,8 @@ def test_bfloat16_where_it_is_safe_and_float32_where_it_matters(fusion):
     model = dataclasses.replace(small.model, dtype="bfloat16", fusion=fusion)
     experiment = dataclasses.replace(small, model=model)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    state, frozen = jax.eval_shape(lambda: initial_state(experiment, VALUES, optimizer))
-    step = make_train_step(experiment, VLA(model), optimizer, NO_NUMBERS)
+    state, frozen = jax.eval_shape(lambda: start_of(experiment, VALUES, optimizer))
+    step = step_of(experiment, optimizer, NO_NUMBERS)
     batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, random_batch(experiment)))
     program = list(equations(jax.make_jaxpr(step)(state, frozen, batch).jaxpr))
 

@@ -19,11 +19,12 @@ from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.variables import split_variables
-from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.model.vla import initialize
 from dsvla_jax.training import loop
 from dsvla_jax.training.metrics import MetricsWriter, rewind
-from dsvla_jax.training.state import TrainState, make_optimizer, make_train_step, start_state
+from dsvla_jax.training.state import TrainState, make_optimizer, start_state
 from dsvla_jax.types import Example, named_arrays
+from tests.learning import learner_of, step_of
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
 
 SMALL = small_experiment(log_every=1, checkpoint_every=3, seed=1)
@@ -37,7 +38,7 @@ class Interrupted(Exception):
 @functools.cache
 def compiled_step():
     optimizer = make_optimizer(EXPERIMENT.optimizer, EXPERIMENT.steps)
-    return jax.jit(make_train_step(EXPERIMENT, VLA(EXPERIMENT.model), optimizer, NO_NUMBERS), donate_argnums=0)
+    return jax.jit(step_of(EXPERIMENT, optimizer, NO_NUMBERS), donate_argnums=0)
 
 
 @functools.cache
@@ -94,6 +95,7 @@ def train(
                 batches=batches,
                 checkpoints=checkpoints,
                 metrics=metrics,
+                learner=learner_of(experiment),
                 checks=checks,
             )
 

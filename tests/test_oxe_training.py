@@ -14,7 +14,8 @@ import pytest
 
 from configs import get_config
 from dsvla_jax.encoding.displacement import displace
-from dsvla_jax.policy import Policy, load_policy, load_policy_config
+from dsvla_jax.policies.three_ds_vla import TextPolicy
+from dsvla_jax.policy import load_policy, load_policy_config
 from dsvla_jax.types import Camera, Observation, Picture, RobotState
 
 ROOT = Path(__file__).parent.parent
@@ -70,9 +71,11 @@ def test_the_documented_sequence(tmp_path: Path):
         Picture(jnp.zeros((1, 96, 96, 3), jnp.uint8), jnp.zeros((1, 1, 1)), Camera(jnp.eye(3)[None], jnp.eye(4)[None])),
         RobotState(jnp.asarray(pose), jnp.ones((1, 1))),
     )
-    bare = Policy(dataclasses.replace(policy.config, displacement=None), policy.variables, policy.tokenizer)
+    bare = TextPolicy(dataclasses.replace(policy.config, displacement=None), policy.variables, policy.tokenizer)
     told, answered = (one.decide(observation, ["lift the ball"], None).action for one in (policy, bare))
-    np.testing.assert_allclose(told.pose, displace(pose, scale.from_pose(answered.pose, policy.codec)), atol=1e-6)
+    np.testing.assert_allclose(
+        told.pose, displace(pose, scale.from_pose(answered.pose, policy.config.encoding.codec)), atol=1e-6
+    )
     assert np.all(np.abs(np.asarray(told.pose)[..., :3] - pose[..., :3]) < 0.5)
 
     finetune = [str(ROOT / "train.py"), "tiny_oxe_sim", "--data.tasks", "lamp_on", "--data.episodes", "4", *small]

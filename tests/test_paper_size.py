@@ -15,9 +15,10 @@ from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.variables import split_variables
-from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.model.vla import initialize
 from dsvla_jax.suite_vocabulary import tokenizer_of
-from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
+from dsvla_jax.training.state import make_optimizer, start_state
+from tests.learning import step_of
 from tests.vocabularies import small_tokenizer
 
 EXPERIMENT = get_config("paper_7b")
@@ -68,7 +69,7 @@ def test_training_step_has_consistent_shapes(shapes):
     trainable, frozen = split_variables(shapes, EXPERIMENT.regime)
     optimizer = make_optimizer(EXPERIMENT.optimizer, EXPERIMENT.steps)
     targets = number_rows(small_tokenizer("sentencepiece"), EXPERIMENT.encoding.style).targets(0.0)
-    step = make_train_step(EXPERIMENT, VLA(EXPERIMENT.model), optimizer, targets)
+    step = step_of(EXPERIMENT, optimizer, targets)
     state = jax.eval_shape(lambda tree: start_state(tree, optimizer, EXPERIMENT.seed), trainable)
     size = EXPERIMENT.data.image_size
     batch = example_spec(EXPERIMENT.encoding, EXPERIMENT.batch_size, size, size)

@@ -17,16 +17,10 @@ from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.prompts import parse_answer
 from dsvla_jax.encoding.text import WordTokenizer
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policy import (
-    BATCH_SIZES,
-    Policy,
-    PolicyConfig,
-    full_size,
-    load_policy,
-    load_policy_config,
-    load_vocabulary,
-    save_policy_config,
-)
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.interface import BATCH_SIZES, full_size
+from dsvla_jax.policies.three_ds_vla import TextPolicy
+from dsvla_jax.policy import load_policy, load_policy_config, load_vocabulary, save_policy_config
 from dsvla_jax.types import Camera, Observation, Picture, RobotState
 from tests.run_folders import MESHES, MODEL, NO_NOTES, variables_only, write_run
 from tests.serving import PROMPTS, observation, tiny_policy
@@ -34,7 +28,7 @@ from tests.vocabularies import small_tokenizer
 
 
 @pytest.fixture(scope="module")
-def policy() -> Policy:
+def policy() -> TextPolicy:
     """A policy whose tokenizer splits digits."""
     small, tokenizer = tiny_policy(), small_tokenizer("sentencepiece")
     encoding = dataclasses.replace(small.config.encoding, max_text_length=200)
@@ -43,7 +37,7 @@ def policy() -> Policy:
         small.config, encoding=encoding, model=dataclasses.replace(small.config.model, language=language)
     )
     variables = jax.jit(lambda: jax.tree.map(lambda x: 3.0 * x, initialize(config.model, jax.random.key(0))))()
-    return Policy(config, variables, tokenizer)
+    return TextPolicy(config, variables, tokenizer)
 
 
 def batch(size: int) -> tuple[Observation, list[str], np.ndarray]:

@@ -21,7 +21,8 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, MeshConfig, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.model.config import LoraConfig, RopeScaling, VisionConfig
 from dsvla_jax.planner.preflight import check_step
-from dsvla_jax.policy import PolicyConfig, load_policy_config, save_policy_config
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policy import load_policy_config, save_policy_config
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
 from dsvla_jax.training.run_folder import require_same_experiment, run_folder

@@ -19,13 +19,15 @@ from flax import traverse_util
 from jax.sharding import AbstractMesh
 
 from configs import get_config
+from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import MeshConfig
 from dsvla_jax.model.partition import MESH_AXES, shardings
 from dsvla_jax.model.variables import join_variables, narrow_frozen, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.sharding import batch_part, make_mesh, part_of_process
-from dsvla_jax.training.state import initial_state, make_optimizer, model_inputs
+from dsvla_jax.training.state import make_optimizer
+from tests.learning import start_of
 from tests.sharded_training import batches, tiny_experiment
 
 ROOT = Path(__file__).parent.parent
@@ -163,7 +165,7 @@ def paper() -> tuple[Any, Any]:
     experiment = get_config("paper_7b")
     values = np.full(experiment.model.language.vocab_size, np.nan, np.float32)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    return jax.eval_shape(partial(initial_state, experiment, values, optimizer))
+    return jax.eval_shape(partial(start_of, experiment, values, optimizer))
 
 
 def whole(tree: Any) -> int:
@@ -192,7 +194,7 @@ def test_a_checkpoint_of_adapters_alone_is_small(paper):
     assert whole(adapters) == 4 * (39_976_960 + 7_077_888) == 188_219_392
     experiment = dataclasses.replace(get_config("paper_7b"), regime="adapters")
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    alone, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+    alone, frozen = jax.eval_shape(partial(start_of, experiment, None, optimizer))
     assert set(alone.trainable) == {"lora"}
     assert whole(alone.trainable) == whole(adapters) < 250e6
     # With the projection, which the paper's regime trains too, it is five times that.

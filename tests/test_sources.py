@@ -24,10 +24,11 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.variables import split_variables
-from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.model.vla import initialize
 from dsvla_jax.suite_vocabulary import suite_tokenizer
-from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
+from dsvla_jax.training.state import make_optimizer, start_state
 from tests import rlbench_files as files
+from tests.learning import step_of
 from tests.small import small_encoding, small_language, small_vision
 
 TASKS = ["lamp_on", "bimanual_lift_ball"]
@@ -101,7 +102,7 @@ def test_an_imported_folder_is_learned(folder):
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     targets = number_rows(tokenizer, "compact").targets(experiment.soft_target_sigma)
     state = start_state(trainable, optimizer, experiment.seed)
-    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, targets))
+    step = jax.jit(step_of(experiment, optimizer, targets))
     losses = []
     for _ in range(experiment.steps):
         state, metrics = step(state, frozen, next(loader))

@@ -10,24 +10,23 @@ import pytest
 
 from dsvla_jax.encoding.encode import encode_text
 from dsvla_jax.encoding.grammar import build_answer_grammar
-from dsvla_jax.encoding.number_targets import NumberTargets, number_rows
+from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.prompts import format_answer, format_prompt
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, OptimizerConfig, load_experiment, save_experiment
 from dsvla_jax.model.config import LoraConfig, ModelConfig, VisualPromptConfig
 from dsvla_jax.model.variables import join_variables, split_variables
-from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.objective import answer_loss
-from dsvla_jax.training.state import make_optimizer, make_train_step, start_state
+from dsvla_jax.model.vla import initialize
+from dsvla_jax.policies.answer_loss import answer_loss
+from dsvla_jax.training.state import make_optimizer, start_state
 from dsvla_jax.types import Example
+from tests.learning import NO_NUMBERS, step_of
 from tests.random_data import random_example, text_example
 from tests.small import small_encoding, small_language, small_vision
 from tests.vocabularies import KINDS, small_tokenizer
 
 VOCABULARY = 40
-
-NO_NUMBERS = NumberTargets(np.zeros(1, np.int32), np.full((1, 1), np.inf, np.float32), None, np.zeros(1, bool))
 
 
 def small_experiment(**changes) -> Experiment:
@@ -55,7 +54,7 @@ def train(experiment: Experiment, steps: int):
     trainable, frozen = split_variables(variables, experiment.regime)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state = start_state(trainable, optimizer, experiment.seed)
-    step = jax.jit(make_train_step(experiment, VLA(experiment.model), optimizer, NO_NUMBERS))
+    step = jax.jit(step_of(experiment, optimizer, NO_NUMBERS))
     losses = []
     for _ in range(steps):
         state, metrics = step(state, frozen, random_batch(experiment))

@@ -26,9 +26,9 @@ from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, OptimizerConfig, ValidationConfig
 from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.policies.answer_errors import guess_integers, number_errors
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
-from dsvla_jax.training.validation import guess_integers, number_errors
 from dsvla_jax.types import HeldOutExample
 from tests.random_data import random_episode, text_example
 from tests.small import small_encoding, small_language, small_vision

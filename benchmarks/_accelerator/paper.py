@@ -21,20 +21,19 @@ from data_pipelines.records import Frame
 from data_pipelines.samples import make_sampler
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.config import EncodingConfig
-from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.point_tokens import PointTokenizerConfig
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import LanguageConfig, LoraConfig, VisionConfig, VisualPromptConfig
+from dsvla_jax.model.flops import model_flops, prefill_flops
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.quantize import quantize
 from dsvla_jax.model.variables import join_variables
-from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.planning import held_bytes, peak_bytes
-from dsvla_jax.policy import Policy, PolicyConfig
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.three_ds_vla import TextPolicy, text_learner
 from dsvla_jax.training.chips import peak_flops
-from dsvla_jax.training.flops import model_flops, prefill_flops
 from dsvla_jax.training.sharding import make_mesh, put_batch
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step, start_state
 from dsvla_jax.types import Action, Example, Observation, Picture, RobotState
@@ -143,7 +142,10 @@ def make_weights(job: Job) -> dict[str, Any]:
         experiment = paper_experiment(job.sizes.name)
         mesh, optimizer = one_device(experiment), make_optimizer(experiment.optimizer, experiment.steps)
         start = time.perf_counter()
-        state, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+        learner = text_learner(experiment.encoding, experiment.model, small_tokenizer("sentencepiece"))
+        dtype = experiment.model.frozen_dtype
+        start_shapes = partial(initial_state, learner, optimizer, experiment.seed, experiment.regime, dtype)
+        state, frozen = jax.eval_shape(start_shapes)
         trainable, job.shared["frozen"] = random_variables((state.trainable, frozen), mesh)
         parameters = sum(leaf.size for leaf in jax.tree.leaves((trainable, frozen)))
         begin = partial(start_state, optimizer=optimizer, seed=experiment.seed)
@@ -168,13 +170,13 @@ def train(job: Job) -> None:
     mesh, peak = one_device(experiment), peak_flops(jax.devices()[:1])
     shared = make_weights(job)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    targets = number_rows(tokenizer, experiment.encoding.style).targets(experiment.soft_target_sigma)
     for number, case in enumerate(job.sizes.train):
         if number and too_late(job, case.name):
             continue
         size, one = case.batch, train_experiment(experiment, case)
         batch = put_batch(train_batch(one, tokenizer, size), mesh)
-        step = jit_train_step(make_train_step(one, VLA(one.model), optimizer, targets), shared["state"], mesh)
+        learner = text_learner(one.encoding, one.model, tokenizer, one.soft_target_sigma)
+        step = jit_train_step(make_train_step(learner, optimizer), shared["state"], mesh)
         start = time.perf_counter()
         lowered = step.lower(shared["state"], shared["frozen"], batch)
         traced = time.perf_counter() - start
@@ -190,7 +192,10 @@ def train(job: Job) -> None:
             return metrics
 
         metrics, timing = timed(once, job.sizes.train_steps)
-        flops, positions = model_flops(one) * size, size * experiment.encoding.max_text_length
+        flops, positions = (
+            model_flops(one.encoding, one.model, one.regime) * size,
+            size * experiment.encoding.max_text_length,
+        )
         figures: dict[str, Any] = {
             **timing.figures(),
             "compile_seconds": compile_seconds,
@@ -238,14 +243,14 @@ def decode(job: Job) -> None:
             continue
         if case.base != base:
             variables, base = {**variables, "params": jax.jit(quantize, donate_argnums=0)(variables["params"])}, "int8"
-        policy, robots = Policy(policy_config(experiment, case), variables, tokenizer), case.robots
+        policy, robots = TextPolicy(policy_config(experiment, case), variables, tokenizer), case.robots
         asked = frames(experiment, robots)
         seen = [(Observation(one.picture, one.robot), one.keypoint) for one in asked]
         observation, keypoints = jax.tree.map(lambda *leaves: np.stack(leaves), *seen)
         observation = jax.tree.map(jnp.asarray, observation)
         instructions = [one.instruction for one in asked]
 
-        def act(policy: Policy = policy, asked: Any = (observation, instructions, keypoints)) -> Action[np.ndarray]:
+        def act(policy: TextPolicy = policy, asked: Any = (observation, instructions, keypoints)) -> Action[np.ndarray]:
             return policy.decide(*asked).action
 
         try:
@@ -278,5 +283,5 @@ def decode_figures(experiment: Experiment, robots: int, timing: Timing) -> dict[
         "milliseconds": 1e3 * timing.median,
         "milliseconds_p95": 1e3 * later[min(len(later) - 1, int(0.95 * len(later)))],
         "actions_per_second": robots / timing.median,
-        "prefill_tflop": robots * sum(prefill_flops(experiment).values()) / 1e12,
+        "prefill_tflop": robots * sum(prefill_flops(experiment.encoding, experiment.model).values()) / 1e12,
     }

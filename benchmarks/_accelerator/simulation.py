@@ -21,7 +21,9 @@ from configs import get_config
 from dsvla_jax.evaluation.device_loop import DeviceLoop
 from dsvla_jax.experiment import Experiment, load_experiment
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policy import Policy, PolicyConfig
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.interface import Policy
+from dsvla_jax.policies.three_ds_vla import TextPolicy
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
@@ -51,7 +53,7 @@ def policy_to_run(job: Job) -> tuple[Policy, Experiment, bool]:
         return dsvla_jax.policy.load_policy(run), load_experiment(run / "config.json"), True
     experiment = get_config("tiny")
     config = PolicyConfig(experiment.encoding, experiment.model)
-    return Policy(config, initialize(experiment.model, jax.random.key(0)), suite_tokenizer()), experiment, False
+    return TextPolicy(config, initialize(experiment.model, jax.random.key(0)), suite_tokenizer()), experiment, False
 
 
 def starts(task: str, image_size: int, split: str, count: int) -> SimState:

@@ -36,13 +36,19 @@ class Arrays:
     """What a step keeps as arrays, each an item of its own on disk.
 
     trainable: the variables that learn, by collection and module. optimizer: the optimizer's state over exactly those.
-    counters: int32 (), by name. rng: random keys, by name.
+    counters: int32 (), by name. rng: random keys, by name. average: the moving average of the variables that learn, by
+    which the policy acts; empty where there is none, and then no item on disk.
     """
 
     trainable: PyTree
     optimizer: PyTree
     counters: Mapping[str, jax.Array]
     rng: Mapping[str, jax.Array]
+    average: PyTree = dataclasses.field(default_factory=dict)
+
+    def items(self) -> dict[str, PyTree]:
+        """Those that are on disk, by name."""
+        return {name: tree for name, tree in vars(self).items() if name != AVERAGE or jax.tree.leaves(tree)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +68,7 @@ class Restored:
     notes: Notes
 
 
+AVERAGE = "average"
 ARRAYS = tuple(field.name for field in dataclasses.fields(Arrays))
 NOTES = tuple(field.name for field in dataclasses.fields(Notes))
 
@@ -106,7 +113,7 @@ class RunCheckpoints:
         lost.
         """
         items: dict[str, ocp.args.CheckpointArgs] = {
-            name: ocp.args.StandardSave(tree) for name, tree in vars(arrays).items()
+            name: ocp.args.StandardSave(tree) for name, tree in arrays.items().items()
         }
         items |= {name: ocp.args.JsonSave(note) for name, note in vars(notes).items()}
         with self._explained():
@@ -132,13 +139,14 @@ class RunCheckpoints:
         Raises CheckpointError if there is no such step, or it belongs to a model of another size.
         """
         step = self._require_step(step)
-        restored = self._read(step, vars(like), NOTES)
-        arrays = Arrays(**{name: restored[name] for name in ARRAYS})
+        restored = self._read(step, like.items(), NOTES)
+        arrays = Arrays(**{name: restored[name] for name in like.items()})
         return Restored(step, arrays, Notes(**{name: restored[name] for name in NOTES}))
 
     def _read(self, step: int, like: Mapping[str, PyTree], notes: tuple[str, ...]) -> Mapping[str, PyTree]:
         """Items of a step by name: arrays as `like` has them, and notes."""
-        require_same_shapes(self._manager.item_metadata(step)["trainable"], like["trainable"], self.folder / str(step))
+        learned = "trainable" if "trainable" in like else AVERAGE
+        require_same_shapes(self._manager.item_metadata(step)[learned], like[learned], self.folder / str(step))
         items: dict[str, ocp.args.CheckpointArgs] = {
             name: ocp.args.StandardRestore(abstract(tree)) for name, tree in like.items()
         }
@@ -154,7 +162,9 @@ class RunCheckpoints:
         return restore_base(self._base, like)
 
     def restore_variables(self, like: PyTree, step: int | Literal["best"] | None = None) -> PyTree:
-        """All variables of a step, trained and frozen joined, with the structure and shapes of `like`.
+        """All variables of a step by which the policy acts, with the structure and shapes of `like`.
+
+        They are the trained ones, or their average where the run keeps one, and the frozen ones.
 
         step: a number, "best", or the newest if not given.
         """
@@ -163,8 +173,9 @@ class RunCheckpoints:
         stored = traverse_util.flatten_dict(tree_of(self._manager.item_metadata(number)["trainable"]))
         frozen = {path: leaf for path, leaf in flat.items() if path not in stored} if self._base.exists() else {}
         trainable = {path: leaf for path, leaf in flat.items() if path not in frozen}
-        restored = self._read(number, {"trainable": traverse_util.unflatten_dict(trainable)}, notes=())
-        variables = traverse_util.flatten_dict(restored["trainable"])
+        acting = AVERAGE if (self.folder / str(number) / AVERAGE).exists() else "trainable"
+        restored = self._read(number, {acting: traverse_util.unflatten_dict(trainable)}, notes=())
+        variables = traverse_util.flatten_dict(restored[acting])
         variables |= traverse_util.flatten_dict(self.restore_base(traverse_util.unflatten_dict(frozen)))
         return traverse_util.unflatten_dict(variables)
 

@@ -162,6 +162,15 @@ def unknown_words(texts: Iterable[str], tokenizer: Tokenizer) -> list[str]:
     return sorted({word for text in texts for word in split_words(text) if not tokenizer.knows(word)})
 
 
+def require_known_words(instruction: str, tokenizer: Tokenizer) -> None:
+    """Raises UserError if a policy's instruction has a word or number that no token stands for."""
+    if unknown := unknown_words([instruction], tokenizer):
+        raise UserError(
+            f"the policy's vocabulary has no token for {quoted(unknown)}; expected words that the policy was trained "
+            "with"
+        )
+
+
 def check_words(where: object, texts: Iterable[str], tokenizer: Tokenizer, command: str) -> None:
     """Raises UserError if a word or number of a text has no token. command: what writes a vocabulary with the words."""
     unknown = unknown_words(texts, tokenizer)

@@ -26,7 +26,7 @@ from dsvla_jax.evaluation.results import require_writable
 from dsvla_jax.experiment import load_experiment, require_simulated
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.perception.simulator import keypoint_source
-from dsvla_jax.policy import Decision, Policy
+from dsvla_jax.policies.interface import Decision, Policy
 from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
@@ -114,14 +114,16 @@ def describe(policy: Policy, seen: Observation, instruction: str, near: np.ndarr
     target = np.asarray(decision.action.pose)[0]
     scale = np.diag([SHOWN / size[1], SHOWN / size[0], 1.0]).astype(np.float32)
     marked = mark_targets(enlarged, target[:, :3], dataclasses.replace(camera, intrinsics=scale @ camera.intrinsics))
+    # Poses come without probabilities.
+    sure = np.ones((len(target), len(NUMBERS))) if decision.log_probs is None else np.exp(decision.log_probs[0])
     bins = parse_answer(decision.texts[0], len(target), encoding.style)
     return Step(
         tokens=png_data(picture),
         target=png_data(draw_keypoints(marked, near, camera, size) if encoding.use_keypoints else marked),
-        prompt=build_prompt(encoding, instruction, one.robot, near),
+        prompt=instruction if policy.config.baseline else build_prompt(encoding, instruction, one.robot, near),
         answer=decision.texts[0],
         numbers=[
-            [(name, str(bins[arm, i]), float(np.exp(decision.log_probs[0, arm, i]))) for i, name in enumerate(NUMBERS)]
+            [(name, str(bins[arm, i]), float(sure[arm, i])) for i, name in enumerate(NUMBERS)]
             for arm in range(len(target))
         ],
     )

@@ -11,22 +11,23 @@ from typing import Any
 import jax
 from jax.sharding import Mesh, NamedSharding
 
-from dsvla_jax.encoding.encode import example_spec, model_inputs
+from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.grammar import build_answer_grammar
-from dsvla_jax.encoding.number_targets import number_rows
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.decode import Decoded, decode_actions
+from dsvla_jax.model.flops import prefill_flops, training_flops
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.hlo import program_cost
+from dsvla_jax.policies.interface import Learner
+from dsvla_jax.policies.registry import make_learner
 from dsvla_jax.training.chips import Chip, Slice
-from dsvla_jax.training.flops import prefill_flops, training_flops
 from dsvla_jax.training.sharding import batch_part, batch_sharding, make_mesh
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
-from dsvla_jax.types import Array, Example, Picture, Text
+from dsvla_jax.types import Array, Picture, Text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,14 +67,22 @@ def planning_tokenizer(experiment: Experiment) -> Tokenizer:
     return load_tokenizer(folder) if experiment.tokenizer and folder.exists() else WordTokenizer(vocabulary(()))
 
 
+def planning_learner(experiment: Experiment) -> Learner[Any, Any]:
+    """The experiment's policy as it learns, with the vocabulary of `planning_tokenizer`."""
+    tokenizer = planning_tokenizer(experiment)
+    return make_learner(
+        experiment.baseline, experiment.encoding, experiment.model, tokenizer, experiment.soft_target_sigma
+    )
+
+
 def plan_training(experiment: Experiment, where: Slice, examples: int) -> Plan:
     """The training step with so many examples a chip. Raises UserError where the mesh does not suit the slice."""
     mesh = make_mesh(experiment.mesh, where.devices)
     experiment = dataclasses.replace(experiment, batch_size=examples * len(where.devices))
     batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     state, frozen, optimizer = abstract_state(experiment, mesh)
-    numbers = number_rows(planning_tokenizer(experiment), experiment.encoding.style)
-    step = make_train_step(experiment, VLA(experiment.model), optimizer, numbers.targets(experiment.soft_target_sigma))
+    learner, average = planning_learner(experiment), experiment.optimizer.average_decay
+    step = make_train_step(learner, optimizer, experiment.gradient_accumulation, average)
     arguments = {"state": state, "frozen base": frozen, "batch": abstract_batch(experiment, mesh)}
     held = {
         "frozen base": bytes_on_a_device(frozen),
@@ -81,7 +90,7 @@ def plan_training(experiment: Experiment, where: Slice, examples: int) -> Plan:
         "optimizer": bytes_on_a_device(state.optimizer),
         "batch": bytes_on_a_device(arguments["batch"]),
     }
-    counted = sum(training_flops(experiment).values()) * examples
+    counted = sum(training_flops(experiment.encoding, experiment.model, experiment.regime).values()) * examples
     lowered = jit_train_step(step, state, mesh).lower(*arguments.values())
     return _plan("training step", lowered, where, mesh, examples, held, counted)
 
@@ -106,7 +115,7 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
         "trainable": bytes_on_a_device(state.trainable),
         "batch": bytes_on_a_device(asked),
     }
-    counted = sum(prefill_flops(experiment).values()) * examples
+    counted = sum(prefill_flops(experiment.encoding, experiment.model).values()) * examples
     lowered = jax.jit(decode).lower(state.trainable, frozen, *asked)
     return _plan("decoding", lowered, where, mesh, examples, held, counted)
 
@@ -184,19 +193,26 @@ def needed_bytes(message: str) -> int | None:
 def abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[Any, Any, Any]:
     """State and frozen variables as shapes with shardings, and the optimizer."""
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    state, frozen = jax.eval_shape(partial(initial_state, experiment, None, optimizer))
+    start = partial(
+        initial_state,
+        planning_learner(experiment),
+        optimizer,
+        experiment.seed,
+        experiment.regime,
+        experiment.model.frozen_dtype,
+        experiment.optimizer.average_decay > 0,
+    )
+    state, frozen = jax.eval_shape(start)
     return *_placed((state, frozen), shardings((state, frozen), mesh)), optimizer
 
 
-def abstract_batch(
-    experiment: Experiment, mesh: Mesh, picture: tuple[int, int] | None = None
-) -> Example[jax.ShapeDtypeStruct]:
+def abstract_batch(experiment: Experiment, mesh: Mesh, picture: tuple[int, int] | None = None) -> Any:
     """Returns a batch of examples as shapes with shardings.
 
     picture: height and width, those of simulated demonstrations if not given.
     """
     size = experiment.data.image_size
-    batch = example_spec(experiment.encoding, experiment.batch_size, *(picture or (size, size)))
+    batch = planning_learner(experiment).example_spec(experiment.batch_size, *(picture or (size, size)))
     return _placed(batch, jax.tree.map(lambda _: batch_sharding(mesh), batch))
 
 

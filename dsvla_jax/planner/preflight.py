@@ -8,13 +8,11 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.variables import Variables, join_variables
-from dsvla_jax.model.vla import VLA
-from dsvla_jax.planner.planning import abstract_batch, abstract_state, bytes_on_a_device
-from dsvla_jax.types import Array, Example
+from dsvla_jax.planner.planning import abstract_batch, abstract_state, bytes_on_a_device, planning_learner
+from dsvla_jax.types import Array
 
 
 def check_step(experiment: Experiment, mesh: Mesh, picture: tuple[int, int]) -> None:
@@ -34,11 +32,12 @@ def check_step(experiment: Experiment, mesh: Mesh, picture: tuple[int, int]) -> 
         )
     batch = abstract_batch(experiment, mesh, picture)
 
-    def logits(trainable: Variables, frozen: Variables, batch: Example[Array]) -> object:
-        inputs = model_inputs(batch.picture, batch.text, experiment.encoding)
-        return VLA(experiment.model).apply(join_variables(trainable, frozen), inputs)
+    learner = planning_learner(experiment)
 
-    largest = max(_outputs(jax.make_jaxpr(logits)(state.trainable, frozen, batch).jaxpr), key=_bytes)
+    def loss(trainable: Variables, frozen: Variables, batch: Any) -> Array:
+        return learner.loss(join_variables(trainable, frozen), batch, learner.totals(batch), jax.random.key(0))[0]
+
+    largest = max(_outputs(jax.make_jaxpr(loss)(state.trainable, frozen, batch).jaxpr), key=_bytes)
     # A batch is computed in parts, and at best every array is split over all devices.
     needed = _bytes(largest) / experiment.gradient_accumulation / mesh.size
     if needed > memory:

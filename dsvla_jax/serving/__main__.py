@@ -20,7 +20,8 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.perception.grounding import GroundingOptions
 from dsvla_jax.perception.simulator import suite_phrases
-from dsvla_jax.policy import PolicyConfig
+from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.registry import make_policy
 from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.serving.server import Limits, Perception, PolicyServer
 from dsvla_jax.sim.tasks import get_task, select_tasks
@@ -78,7 +79,8 @@ def build_server(options: Options) -> PolicyServer:
         grounding = options.grounding
         phrases = (*grounding.table(), *suite_phrases())
         perception = Perception(grounding.segmenter(), phrases, options.perception == "refresh")
-    policy = dataclasses.replace(policies.load_policy(options.run), config=config)
+    loaded = policies.load_policy(options.run)
+    policy = make_policy(config, loaded.variables, loaded.tokenizer)
     return PolicyServer(policy, sizes, arms, options.limits, token, options.run.name, perception)
 
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from dsvla_jax.geometry.cameras import front_camera
-from dsvla_jax.policy import BATCH_SIZES, Policy
+from dsvla_jax.policies.interface import BATCH_SIZES, Policy
 from dsvla_jax.types import TABLE_HEIGHT, Observation, Picture, RobotState
 
 
@@ -32,7 +32,7 @@ class Question:
 class Answer:
     """The next keyframe of one robot: pose float32 (A, 7), gripper_open float32 (A,), and the text that says it.
 
-    log_probs: A lists of 8, of each number of the text.
+    log_probs: A lists of 8, of each number of the text; empty for a policy that answers with poses.
     """
 
     pose: np.ndarray
@@ -57,9 +57,8 @@ def batch_sizes(largest: int) -> tuple[int, ...]:
 
 def prompt_length(policy: Policy, arms: int, instruction_tokens: int) -> int:
     """Tokens of a prompt with numbers of the most digits and an instruction of so many tokens; at most the policy's."""
-    pose = np.tile(
-        np.array([*policy.codec.low[:2], policy.codec.high[2], -0.5, -0.5, -0.5, 0.5], np.float32), (arms, 1)
-    )
+    codec = policy.config.encoding.codec
+    pose = np.tile(np.array([*codec.low[:2], codec.high[2], -0.5, -0.5, -0.5, 0.5], np.float32), (arms, 1))
     keypoints = pose[:, :3] if policy.config.wants_keypoints else None
     text = policy.encode_prompt("", RobotState(pose, np.ones(arms, np.float32)), keypoints)
     return min(policy.config.encoding.max_text_length, int(text.mask.sum()) + instruction_tokens)
@@ -74,7 +73,8 @@ def answer_batch(policy: Policy, questions: Sequence[Question], prompt_tokens: i
     decision = policy.decide(observation, instructions, keypoints, prompt_tokens=prompt_tokens)
     poses, grippers = np.asarray(decision.action.pose), np.asarray(decision.action.gripper_open)
     return [
-        Answer(poses[i], grippers[i], text, decision.log_probs[i].tolist()) for i, text in enumerate(decision.texts)
+        Answer(poses[i], grippers[i], text, [] if decision.log_probs is None else decision.log_probs[i].tolist())
+        for i, text in enumerate(decision.texts)
     ]
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 from dsvla_jax.encoding.text import WordTokenizer
-from dsvla_jax.policy import Policy
+from dsvla_jax.policies.interface import Policy
 from dsvla_jax.serving.requests import Expected
 from dsvla_jax.types import TABLE_HEIGHT
 
@@ -26,7 +26,7 @@ def describe(name: str, policy: Policy, expected: Expected, finds_keypoints: boo
         "reply": {
             "actions": "float32 (1, A * 8): the next keyframe, x y z qx qy qz qw gripper_open of each arm",
             "text": "the policy's answer",
-            "log_probs": "of each of its numbers, 8 an arm",
+            "log_probs": "of each of its numbers, 8 an arm; empty for a policy that answers with poses",
             "keypoint": "the active keypoint of each arm, metres, world frame, or None",
             "reached": "how many keypoints each arm has reached",
             "points": "how many points of the depth map the policy used, or None without 3D input",

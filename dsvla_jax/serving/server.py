@@ -25,7 +25,7 @@ from websockets.http11 import Response
 from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import KeypointTracker, Segmenter
 from dsvla_jax.perception.phrases import ObjectPhrases, phrases_for
-from dsvla_jax.policy import BATCH_SIZES, Policy
+from dsvla_jax.policies.interface import BATCH_SIZES, Policy
 from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.serving.batching import (
     Answer,

@@ -6,13 +6,14 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.types import Array, Example, named_arrays
+from dsvla_jax.types import Array, named_arrays
 
 
 class SkippedSteps:
@@ -25,9 +26,9 @@ class SkippedSteps:
 
     def __init__(self, folder: Path, limit: int, seen: int) -> None:
         self._folder, self._limit, self._seen = folder, limit, seen
-        self._pending: tuple[int, Example[np.ndarray], Array] | None = None
+        self._pending: tuple[int, Any, Array] | None = None
 
-    def watch(self, step: int, batch: Example[np.ndarray], total: Array) -> None:
+    def watch(self, step: int, batch: Any, total: Array) -> None:
         """batch: this process's part, on the host. total: int32 (), skipped steps up to and with this one."""
         self.settle()
         self._pending = (step, batch, total)

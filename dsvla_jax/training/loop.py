@@ -8,26 +8,24 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import jax
-import numpy as np
 from tqdm import tqdm
 
 from dsvla_jax.checkpoints.run import Arrays, Notes, Restored, RunCheckpoints
 from dsvla_jax.experiment import Experiment
+from dsvla_jax.policies.interface import Learner
 from dsvla_jax.training.chips import peak_flops
-from dsvla_jax.training.flops import model_flops
 from dsvla_jax.training.health import Clock, SkippedSteps, memory
 from dsvla_jax.training.metrics import MetricsWriter
 from dsvla_jax.training.signals import StopRequest
 from dsvla_jax.training.state import TrainState
-from dsvla_jax.types import Example
 
-Step = Callable[[TrainState, Example[np.ndarray]], tuple[TrainState, dict[str, Any]]]
+Step = Callable[[TrainState, Any], tuple[TrainState, dict[str, Any]]]
 
 
 class Batches(Protocol):
     """An endless stream of batches whose position can be saved as JSON."""
 
-    def __next__(self) -> Example[np.ndarray]: ...
+    def __next__(self) -> Any: ...
     def get_state(self) -> dict[str, Any]: ...
     def set_state(self, state: dict[str, Any]) -> None: ...
 
@@ -62,19 +60,22 @@ def train(
     batches: Batches,
     checkpoints: RunCheckpoints,
     metrics: MetricsWriter,
+    learner: Learner[Any, Any],
     checks: Sequence[PeriodicEval] = (),
     note: Callable[[str], None] = lambda doing: None,
 ) -> signal.Signals | None:
     """Trains from the state's step to the experiment's last, saving on the way and at the end.
 
     step: trains on this process's part of a batch; may consume the state that it is given.
+    learner: of the policy that is trained, for what is counted and shown.
     checks: a step that their figures give a score (`score_of`) is saved, and its checkpoint carries the score.
     note: is told what is being done, in words that name the step.
     Returns the signal that asked to stop, None where training is finished. Either way the last step is on disk.
     Raises UserError where a checkpoint cannot be written, or too many steps were not finite.
     """
     first = done = int(state.step)
-    clock = Clock(model_flops(experiment), peak_flops(jax.devices()))
+    name, words = learner.progress
+    clock = Clock(learner.flops(experiment.regime), peak_flops(jax.devices()))
     skipped = SkippedSteps(run / "skipped", experiment.max_skipped_steps, int(state.skipped))
     bar = tqdm(total=experiment.steps, initial=first, unit="step", desc="train", disable=jax.process_index() > 0)
     stop: signal.Signals | None = None
@@ -93,12 +94,13 @@ def train(
                 bar.set_postfix_str("")
                 clock.start()
             else:
-                clock.count(experiment.batch_size, int(batch.text.mask.sum()) * jax.process_count())
+                clock.count(experiment.batch_size, learner.tokens(batch) * jax.process_count())
             figures: dict[str, float] = {}
             if is_due(done, experiment.log_every) or done == experiment.steps:
-                numbers = {name: float(value) for name, value in values.items()}
+                numbers = {figure: float(value) for figure, value in values.items()}
                 figures = {**numbers, **clock.read(), **memory()}
-                bar.set_postfix_str(f"loss {numbers['loss']:.3f}, bins within one {numbers['bin_within_one']:.2f}")
+                shown = f", {words} {numbers[name]:.2f}" if name in numbers else ""
+                bar.set_postfix_str(f"loss {numbers['loss']:.3f}{shown}")
                 checkpoints.raise_if_failed()
             for check in checks:
                 # Whoever asks to stop is not kept waiting.
@@ -139,7 +141,7 @@ def score_of(figures: Mapping[str, float]) -> float | None:
 def arrays_of(state: TrainState) -> Arrays:
     """The state as `RunCheckpoints` keeps it."""
     counters = {"step": state.step, "skipped": state.skipped}
-    return Arrays(state.trainable, state.optimizer, counters, rng={"key": state.rng})
+    return Arrays(state.trainable, state.optimizer, counters, {"key": state.rng}, state.average or {})
 
 
 def notes_of(experiment: Experiment, batches: Batches) -> Notes:
@@ -156,4 +158,5 @@ def state_of(restored: Restored) -> TrainState:
         optimizer=arrays.optimizer,
         skipped=arrays.counters["skipped"],
         rng=arrays.rng["key"],
+        average=arrays.average or None,
     )

@@ -13,6 +13,8 @@ def require_possible(experiment: Experiment) -> None:
     # The default suits every run, because warm-up is a fifth of it at most.
     if warmup > experiment.steps and warmup != OptimizerConfig().warmup_steps:
         raise UserError(f"optimizer.warmup_steps: expected at most steps ({experiment.steps}), got {warmup}")
+    if experiment.baseline is not None and experiment.oxe is not None:
+        raise UserError("baseline: Open X-Embodiment mixtures are written as 3DS-VLA's text; leave one of the two out")
     if experiment.evaluate_every:
         if experiment.oxe is not None:
             raise UserError("evaluate_every: the simulator has no tasks of Open X-Embodiment; set it to 0")

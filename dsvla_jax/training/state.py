@@ -5,19 +5,15 @@ from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from dsvla_jax.encoding.encode import model_inputs
-from dsvla_jax.encoding.number_targets import NumberTargets
-from dsvla_jax.experiment import Experiment, OptimizerConfig
+from dsvla_jax.experiment import OptimizerConfig
 from dsvla_jax.model.partition import constrain, shardings
-from dsvla_jax.model.variables import Variables, join_variables, narrow_frozen, split_variables
-from dsvla_jax.model.vla import VLA, initialize
-from dsvla_jax.training.objective import answer_counts, answer_loss
-from dsvla_jax.types import Array, Example
+from dsvla_jax.model.variables import Regime, Variables, join_variables, narrow_frozen, split_variables
+from dsvla_jax.policies.interface import Learner
+from dsvla_jax.types import Array
 
 
 @struct.dataclass
@@ -27,6 +23,7 @@ class TrainState:
     step: int32 (). trainable: the variables that learn. optimizer: optax state over exactly those.
     skipped: int32 (), steps whose loss or gradient was not finite; they changed nothing.
     rng: the key of what is random in the network, the same at every step; a step folds its number in.
+    average: the moving average of the variables that learn, by which the policy acts; None where there is none.
     """
 
     step: Array
@@ -34,38 +31,48 @@ class TrainState:
     optimizer: optax.OptState
     skipped: Array
     rng: Array
+    average: Variables | None = None
+
+    @property
+    def acting(self) -> Variables:
+        """Those of the variables that learn by which the policy acts."""
+        return self.trainable if self.average is None else self.average
 
 
+Example = TypeVar("Example")
 Summed = TypeVar("Summed")
-TrainStep = Callable[[TrainState, Variables, Example[Array]], tuple[TrainState, dict[str, Array]]]
+TrainStep = Callable[[TrainState, Variables, Example], tuple[TrainState, dict[str, Array]]]
 
 
 def initial_state(
-    experiment: Experiment,
-    number_values: np.ndarray | None,
+    learner: Learner,
     optimizer: optax.GradientTransformation,
+    seed: int,
+    regime: Regime,
+    frozen_dtype: jnp.dtype,
+    average: bool = False,
     base: Variables | None = None,
 ) -> tuple[TrainState, Variables]:
     """State and frozen variables at step 0: random by the seed, the towers of ``base`` in the place of random ones.
 
-    number_values: the tokenizer's; embeddings may have more rows than it has tokens.
+    frozen_dtype: of matrices that do not learn. average: whether there is a moving average.
     Pure: `make_sharded` makes every leaf where it lives, and none of them is ever whole on one device.
     """
-    if number_values is not None:
-        more = experiment.model.language.vocab_size - len(number_values)
-        number_values = np.pad(number_values, (0, more), constant_values=np.nan)
-    variables = initialize(experiment.model, jax.random.key(experiment.seed), number_values)
+    variables = learner.initialise(jax.random.key(seed))
     for collection, towers in (base or {}).items():
         variables[collection] = {**variables[collection], **towers}
-    trainable, frozen = split_variables(variables, experiment.regime)
-    state = start_state(trainable, optimizer, experiment.seed)
-    return state, narrow_frozen(frozen, experiment.model.frozen_dtype)
+    trainable, frozen = split_variables(variables, regime)
+    return start_state(trainable, optimizer, seed, average), narrow_frozen(frozen, frozen_dtype)
 
 
-def start_state(trainable: Variables, optimizer: optax.GradientTransformation, seed: int) -> TrainState:
+def start_state(
+    trainable: Variables, optimizer: optax.GradientTransformation, seed: int, average: bool = False
+) -> TrainState:
     """The state at step 0 of variables that learn."""
     zero = jnp.zeros((), jnp.int32)
-    return TrainState(zero, trainable, optimizer.init(trainable), jnp.zeros_like(zero), jax.random.key(seed))
+    # A copy, because a step gives up the memory of all that it is given.
+    mean = jax.tree.map(jnp.copy, trainable) if average else None
+    return TrainState(zero, trainable, optimizer.init(trainable), jnp.zeros_like(zero), jax.random.key(seed), mean)
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
@@ -89,45 +96,55 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
 
 
 def make_train_step(
-    experiment: Experiment, model: VLA, optimizer: optax.GradientTransformation, targets: NumberTargets
-) -> TrainStep:
+    learner: Learner[Example, Any],
+    optimizer: optax.GradientTransformation,
+    accumulation: int = 1,
+    average_decay: float = 0.0,
+) -> TrainStep[Example]:
     """``step(state, frozen, batch) -> (state, metrics)``, to be jitted by the caller (`jit_train_step`).
 
     Gradients are taken with respect to the trainable variables only: frozen parameters cost no weight gradient.
     A step whose loss or gradient is not finite leaves variables and optimizer as they were, and is counted.
-    targets: of the tokenizer and style that the batches were written with.
+    accumulation: parts in which a batch is computed. average_decay: of the state's moving average, see `average_with`.
     """
 
-    def step(state: TrainState, frozen: Variables, batch: Example[Array]) -> tuple[TrainState, dict[str, Array]]:
-        counts = answer_counts(batch, targets)
+    def step(state: TrainState, frozen: Variables, batch: Example) -> tuple[TrainState, dict[str, Array]]:
+        totals, key = learner.totals(batch), jax.random.fold_in(state.rng, state.step)
 
-        def part(batch: Example[Array]) -> tuple[Variables, dict[str, Array]]:
+        def part(batch: Example) -> tuple[Variables, dict[str, Array]]:
             batch = jax.tree.map(lambda leaf: constrain(leaf, "batch"), batch)
-            inputs = model_inputs(batch.picture, batch.text, experiment.encoding)
 
-            def loss_of(trainable: Variables):
-                dropout = jax.random.fold_in(state.rng, state.step)
-                logits = model.apply(join_variables(trainable, frozen), inputs, rngs={"dropout": dropout})
-                assert isinstance(logits, jax.Array)
-                return answer_loss(logits, batch, targets, counts)
+            def loss_of(trainable: Variables) -> tuple[Array, dict[str, Array]]:
+                return learner.loss(join_variables(trainable, frozen), batch, totals, key)
 
             gradients, metrics = jax.grad(loss_of, has_aux=True)(state.trainable)
             return gradients, metrics
 
-        gradients, metrics = _sum_over_parts(part, batch, experiment.gradient_accumulation)
+        gradients, metrics = _sum_over_parts(part, batch, accumulation)
         updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.trainable)
         trainable = cast(Variables, optax.apply_updates(state.trainable, updates))
+        average = state.average and average_with(state.average, trainable, state.step, average_decay)
         metrics |= gradient_norms(gradients)
         finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["gradient_norm"])
-        trainable, optimizer_state = jax.tree.map(
+        trainable, optimizer_state, average = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old),
-            (trainable, optimizer_state),
-            (state.trainable, state.optimizer),
+            (trainable, optimizer_state, average),
+            (state.trainable, state.optimizer, state.average),
         )
-        metrics["skipped_steps"] = state.skipped + ~finite
-        return TrainState(state.step + 1, trainable, optimizer_state, metrics["skipped_steps"], state.rng), metrics
+        skipped = metrics["skipped_steps"] = state.skipped + ~finite
+        return TrainState(state.step + 1, trainable, optimizer_state, skipped, state.rng, average), metrics
 
     return step
+
+
+def average_with(average: Variables, trainable: Variables, step: Array, decay: float) -> Variables:
+    """The moving average with the variables after a step in it.
+
+    decay: the largest share of the old average; at first it is 1 - (1 + step)^-0.75, as the code of 3D Diffusion Policy
+    has it (diffusion_policy_3d/model/diffusion/ema_model.py).
+    """
+    kept = jnp.minimum(decay, 1 - (1.0 + step) ** -0.75)
+    return jax.tree.map(lambda mean, new: kept * mean + (1 - kept) * new, average, trainable)
 
 
 def gradient_norms(gradients: Variables) -> dict[str, Array]:
@@ -140,10 +157,10 @@ def gradient_norms(gradients: Variables) -> dict[str, Array]:
     return {"gradient_norm": jnp.sqrt(sum(norm**2 for norm in parts.values())), **parts}
 
 
-def jit_train_step(step: TrainStep, state: TrainState, mesh: Mesh) -> Any:
+def jit_train_step(step: TrainStep[Example], state: TrainState, mesh: Mesh) -> Any:
     """The step compiled for a mesh. The state stays split as it is, and its memory is used for the next one."""
 
-    def on_mesh(state: TrainState, frozen: Variables, batch: Example[Array]) -> tuple[TrainState, dict[str, Array]]:
+    def on_mesh(state: TrainState, frozen: Variables, batch: Example) -> tuple[TrainState, dict[str, Array]]:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
             return step(state, frozen, batch)
 
@@ -151,7 +168,7 @@ def jit_train_step(step: TrainStep, state: TrainState, mesh: Mesh) -> Any:
     return jax.jit(on_mesh, donate_argnums=0, out_shardings=(shardings(state, mesh), everywhere))
 
 
-def _sum_over_parts(part: Callable[[Example[Array]], Summed], batch: Example[Array], count: int) -> Summed:
+def _sum_over_parts(part: Callable[[Example], Summed], batch: Example, count: int) -> Summed:
     """The sum of ``part`` over ``count`` equal parts of a batch, one after the other.
 
     A part takes every count-th example, so that each device has its share of it without any exchange.

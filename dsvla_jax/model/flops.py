@@ -11,8 +11,9 @@ before the first weight that learns (patches) has a forward pass only.
 import dataclasses
 from typing import Literal
 
-from dsvla_jax.experiment import Experiment
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig
+from dsvla_jax.model.variables import Regime
 
 # Passes over a product: of the blocks, computed again or not, and of what stands outside of them.
 Passes = Literal["training", "inference"]
@@ -32,30 +33,29 @@ class _Block:
     learns: bool
 
 
-def training_flops(experiment: Experiment) -> dict[str, int]:
+def training_flops(encoding: EncodingConfig, model: ModelConfig, regime: Regime) -> dict[str, int]:
     """Of one example in one training step, by part of the network."""
-    return _flops(experiment, experiment.encoding.max_text_length, "training")
+    return _flops(encoding, model, regime, "training")
 
 
-def model_flops(experiment: Experiment) -> int:
+def model_flops(encoding: EncodingConfig, model: ModelConfig, regime: Regime) -> int:
     """Counts the FLOPs of one example in one training step, without what rematerialisation computes again.
 
     The utilisation of a chip is counted by them (PaLM, https://arxiv.org/abs/2204.02311, appendix B).
     """
-    plain = dataclasses.replace(experiment, model=dataclasses.replace(experiment.model, remat="none"))
-    return sum(training_flops(plain).values())
+    return sum(training_flops(encoding, dataclasses.replace(model, remat="none"), regime).values())
 
 
-def prefill_flops(experiment: Experiment) -> dict[str, int]:
+def prefill_flops(encoding: EncodingConfig, model: ModelConfig) -> dict[str, int]:
     """Of reading one example's picture and prompt before an answer is decoded; the logits of one position."""
-    return _flops(experiment, experiment.encoding.max_text_length, "inference")
+    return _flops(encoding, model, "full", "inference")
 
 
-def _flops(experiment: Experiment, text: int, passes: Passes) -> dict[str, int]:
-    config, full = experiment.model, experiment.regime == "full"
+def _flops(encoding: EncodingConfig, config: ModelConfig, regime: Regime, passes: Passes) -> dict[str, int]:
+    full, text = regime == "full", encoding.max_text_length
     vision, language, prompt = config.vision, config.language, config.visual_prompt
     patches = vision.num_patches
-    tokens = 1 + patches + experiment.encoding.num_point_tokens
+    tokens = 1 + patches + encoding.num_point_tokens
     training = passes == "training"
 
     clip = _Block(
@@ -80,7 +80,7 @@ def _flops(experiment: Experiment, text: int, passes: Passes) -> dict[str, int]:
         total["vision projection"] = 2 * tokens * vision.width * width * (1 + training + (training and full))
 
     sequence, prompted = text, 0
-    projects = experiment.regime != "adapters"
+    projects = regime != "adapters"
     learned = 2 + projects if training else 1
     if config.fusion == "prefix":
         sequence += tokens

@@ -1,0 +1,11 @@
+"""Behaviour cloning on `tiny`'s trunk: the keyframe as numbers instead of text. What 3DS-VLA is compared with."""
+
+import dataclasses
+
+from configs.tiny import config as tiny
+from dsvla_jax.experiment import Experiment
+from dsvla_jax.policies.config import BehaviourCloningConfig
+
+
+def config() -> Experiment:
+    return dataclasses.replace(tiny(), baseline=BehaviourCloningConfig(), soft_target_sigma=0.0)

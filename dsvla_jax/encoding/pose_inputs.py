@@ -1,0 +1,89 @@
+"""The one path from what a robot sees and is told to the inputs of policies that answer with poses."""
+
+from types import ModuleType
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Float
+
+from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.errors import UserError
+from dsvla_jax.types import Array, Camera, Picture, PoseExample, PoseInputs, RobotState, Text
+
+AnyArray = TypeVar("AnyArray", np.ndarray, jax.Array)
+
+ARMS = 2
+
+
+def with_two_arms(array: AnyArray, axis: int) -> AnyArray:
+    """The array with zeros for the second arm of a robot that has one, along the axis of arms."""
+    missing = ARMS - array.shape[axis]
+    if not missing:
+        return array
+    widths = [(0, missing if place == axis else 0) for place in range(array.ndim)]
+    return _library(array).pad(array, widths)
+
+
+def pose_inputs(
+    picture: Picture[AnyArray],
+    robot: RobotState[AnyArray],
+    words: Text[AnyArray],
+    keypoints: Float[AnyArray, "*b a 3"] | None,
+) -> PoseInputs[AnyArray]:
+    """Puts the inputs of one robot, or of a batch of robots with equally many arms, together.
+
+    keypoints: the active one of each arm, metres, world frame, or None.
+    """
+    library = _library(robot.pose)
+    *batch, arms, _ = robot.pose.shape
+    axis = len(batch)
+    state = RobotState(with_two_arms(robot.pose, axis), with_two_arms(robot.gripper_open, axis))
+    there: AnyArray = library.broadcast_to(library.arange(ARMS) < arms, (*batch, ARMS))
+    near: AnyArray = library.zeros((*batch, ARMS, 3), np.float32)
+    if keypoints is not None:
+        near = with_two_arms(keypoints, axis)
+    has_keypoints: AnyArray = library.full(tuple(batch), keypoints is not None)
+    return PoseInputs(picture, state, there, words, near, has_keypoints)
+
+
+def encode_instruction(tokenizer: Tokenizer, instruction: str, length: int) -> Text[np.ndarray]:
+    """Encodes an instruction on the host, padded to so many tokens. Raises UserError where they are too few."""
+    tokens = [tokenizer.bos_id, *tokenizer.encode(instruction)]
+    if len(tokens) > length:
+        raise UserError(
+            f"text: {len(tokens)} tokens are more than max_text_length {length}; raise it, or shorten {instruction!r}"
+        )
+    padded = np.full(length, tokenizer.pad_id, np.int32)
+    padded[: len(tokens)] = tokens
+    return Text(padded, np.arange(length) < len(tokens))
+
+
+def pose_example_spec(
+    batch: int, height: int, width: int, words: int, upcoming: int
+) -> PoseExample[jax.ShapeDtypeStruct]:
+    """The shapes and dtypes of a batch of examples with pictures of (height, width)."""
+
+    def spec(dtype: DTypeLike, *shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((batch, *shape), dtype)
+
+    picture = Picture(
+        spec(jnp.uint8, height, width, 3),
+        spec(jnp.float32, height, width),
+        Camera(spec(jnp.float32, 3, 3), spec(jnp.float32, 4, 4)),
+    )
+    inputs = PoseInputs(
+        picture,
+        RobotState(spec(jnp.float32, ARMS, 7), spec(jnp.float32, ARMS)),
+        spec(jnp.bool_, ARMS),
+        Text(spec(jnp.int32, words), spec(jnp.bool_, words)),
+        spec(jnp.float32, ARMS, 3),
+        spec(jnp.bool_),
+    )
+    return PoseExample(inputs, spec(jnp.float32, upcoming, ARMS, 7), spec(jnp.float32, upcoming, ARMS))
+
+
+def _library(array: np.ndarray | Array) -> ModuleType:
+    return np if isinstance(array, np.ndarray) else jnp

@@ -1,0 +1,40 @@
+"""Learners and policies from a config: the one place that knows which policies there are."""
+
+from typing import Any
+
+from dsvla_jax.encoding.config import EncodingConfig
+from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.model.decode import GREEDY, Decoding
+from dsvla_jax.model.variables import Variables
+from dsvla_jax.policies.config import Baseline, PolicyConfig
+from dsvla_jax.policies.interface import Learner, Policy
+from dsvla_jax.policies.networks import make_network
+from dsvla_jax.policies.pose_policy import PoseLearner, PosePolicy
+from dsvla_jax.policies.three_ds_vla import TextPolicy, text_learner
+
+
+def make_learner(
+    baseline: Baseline | None,
+    encoding: EncodingConfig,
+    model: ModelConfig,
+    tokenizer: Tokenizer,
+    soft_target_sigma: float = 0.0,
+) -> Learner[Any, Any]:
+    """How a policy learns, from examples of its own kind.
+
+    baseline: None for 3DS-VLA. soft_target_sigma: see `text_learner`.
+    """
+    if baseline is None:
+        return text_learner(encoding, model, tokenizer, soft_target_sigma)
+    network = make_network(baseline, encoding, model, tokenizer)
+    return PoseLearner(network, encoding)
+
+
+def make_policy(
+    config: PolicyConfig, variables: Variables, tokenizer: Tokenizer, decoding: Decoding = GREEDY
+) -> Policy:
+    """A policy ready to act. decoding: of 3DS-VLA's answers."""
+    if config.baseline is None:
+        return TextPolicy(config, variables, tokenizer, decoding)
+    return PosePolicy(config, variables, tokenizer)
