@@ -12,7 +12,7 @@ def config() -> Experiment:
     return Experiment(
         baseline=DP3Config(channels=(64, 128, 256)),
         encoding=plain.encoding,
-        data=dataclasses.replace(plain.data, shift_world=0.0),
+        data=dataclasses.replace(plain.data, shift_world=0.0, state_jitter=0.0),
         optimizer=OptimizerConfig(learning_rate=5e-4, weight_decay=1e-6, average_decay=0.999),
         steps=2500,
         batch_size=32,

@@ -25,7 +25,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.policies.config import Baseline, BehaviourCloningConfig, DP3Config, PolicyConfig
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
 from dsvla_jax.policies.dp3 import PointEncoder
-from dsvla_jax.policies.pose_vectors import from_vectors, to_vectors
+from dsvla_jax.policies.pose_vectors import center, from_vectors, to_vectors
 from dsvla_jax.policies.registry import make_learner, make_policy
 from dsvla_jax.policy import load_policy, save_policy_config
 from dsvla_jax.training.loop import arrays_of, state_of
@@ -77,12 +77,12 @@ def example(rng: np.random.Generator, count: int, arms: int = 1, upcoming: int =
 def test_vectors_hold_the_first_two_columns_of_the_rotation_and_lead_back():
     rng = np.random.default_rng(0)
     pose, gripper = poses(rng, 50), rng.integers(0, 2, 50).astype(np.float32)
-    vectors = np.asarray(to_vectors(jnp.asarray(pose), jnp.asarray(gripper), CODEC))
+    vectors = np.asarray(to_vectors(jnp.asarray(pose), jnp.asarray(gripper), center(CODEC), CODEC))
     matrix = Rotation.from_quat(pose[:, 3:]).as_matrix()
     np.testing.assert_allclose(vectors[:, 3:6], matrix[:, :, 0], atol=1e-5)
     np.testing.assert_allclose(vectors[:, 6:9], matrix[:, :, 1], atol=1e-5)
     np.testing.assert_allclose(vectors[:, :3], pose[:, :3] - [0, 0, 1], atol=1e-5)  # a box of 2 m around (0, 0, 1)
-    back = from_vectors(jnp.asarray(vectors), CODEC)
+    back = from_vectors(jnp.asarray(vectors), center(CODEC), CODEC)
     np.testing.assert_allclose(back.pose[:, :3], pose[:, :3], atol=1e-5)
     turned = Rotation.from_quat(np.asarray(back.pose)[:, 3:]) * Rotation.from_quat(pose[:, 3:]).inv()
     assert turned.magnitude().max() < 1e-3
@@ -90,7 +90,7 @@ def test_vectors_hold_the_first_two_columns_of_the_rotation_and_lead_back():
 
 
 def test_any_vector_is_a_keyframe_in_the_box():
-    action = from_vectors(jax.random.normal(jax.random.key(0), (100, 10)) * 3, CODEC)
+    action = from_vectors(jax.random.normal(jax.random.key(0), (100, 10)) * 3, center(CODEC), CODEC)
     np.testing.assert_allclose(np.linalg.norm(action.pose[:, 3:], axis=-1), 1, atol=1e-4)
     assert np.all((action.pose[:, :3] >= np.array(CODEC.low)) & (action.pose[:, :3] <= np.array(CODEC.high)))
     assert set(np.unique(action.gripper_open)) <= {0.0, 1.0}

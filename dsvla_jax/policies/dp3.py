@@ -24,7 +24,7 @@ from dsvla_jax.model.variables import Variables
 from dsvla_jax.policies.config import DP3Config
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
 from dsvla_jax.policies.pose_network import Vectors, mean_over_arm
-from dsvla_jax.policies.pose_vectors import VECTOR, scale_position
+from dsvla_jax.policies.pose_vectors import VECTOR, center, scale_position
 from dsvla_jax.policies.robot_vector import robot_vector
 from dsvla_jax.types import Array, PoseInputs, Text
 
@@ -165,7 +165,7 @@ class DP3:
     def _condition(self, variables: Variables, inputs: PoseInputs[Array]) -> Array:
         codec = self.encoding.codec
         points, colours = coloured_cloud(inputs.picture, self.encoding)
-        points = scale_position(points, codec)
+        points = scale_position(points, center(codec), codec)
         if self.config.colours:
             points = jnp.concatenate([points, colours], axis=-1)
         robot = robot_vector(inputs, codec)

@@ -52,7 +52,7 @@ class PoseLearner:
     ) -> tuple[Array, dict[str, Array]]:
         """See `Learner`. Where answers cost nothing, their errors are among the metrics."""
         (count,), there = totals, part.inputs.arms
-        target = to_vectors(part.pose, part.gripper_open, self.encoding.codec)
+        target = target_vectors(part, self.encoding.codec)
         losses, vectors = self.network.losses(variables, part.inputs, target, key)
         loss = jnp.where(there, losses, 0).sum() / count
         metrics = {} if vectors is None else answer_errors(vectors, part, self.encoding.codec)
@@ -61,7 +61,7 @@ class PoseLearner:
     def errors(self, variables: Variables, batch: PoseExample[Array], key: Array) -> dict[str, tuple[Array, Array]]:
         """See `Learner`."""
         there = batch.inputs.arms
-        target = to_vectors(batch.pose, batch.gripper_open, self.encoding.codec)
+        target = target_vectors(batch, self.encoding.codec)
         losses, vectors = self.network.losses(variables, batch.inputs, target, key)
         if vectors is None:
             vectors = self.network.answer(variables, batch.inputs, jax.random.key(ANSWER_SEED))
@@ -89,9 +89,19 @@ class PoseLearner:
         return pose_example_spec(batch, height, width, self.encoding.max_text_length, self.network.upcoming)
 
 
+def target_vectors(batch: PoseExample[Array], codec: PoseCodec) -> Vectors:
+    """What is learned: the keyframes that follow, from where each arm is."""
+    return to_vectors(batch.pose, batch.gripper_open, batch.inputs.robot.pose[:, None, :, :3], codec)
+
+
+def first_keyframe(vectors: Vectors, inputs: PoseInputs[Array], codec: PoseCodec) -> Action[Array]:
+    """The keyframe to execute, of both arms."""
+    return from_vectors(vectors[:, 0], inputs.robot.pose[..., :3], codec)
+
+
 def answer_errors(vectors: Vectors, batch: PoseExample[Array], codec: PoseCodec) -> dict[str, Float[Array, "b 2"]]:
     """Compares the first keyframe of answers with the demonstration's, for each arm."""
-    answer = from_vectors(vectors[:, 0], codec)
+    answer = first_keyframe(vectors, batch.inputs, codec)
     pose, gripper = batch.pose[:, 0], batch.gripper_open[:, 0]
     return {
         "position_cm": 100 * jnp.linalg.norm(answer.pose[..., :3] - pose[..., :3], axis=-1),
@@ -102,7 +112,7 @@ def answer_errors(vectors: Vectors, batch: PoseExample[Array], codec: PoseCodec)
 
 @partial(jax.jit, static_argnames=("network", "codec"))
 def _act(network: PoseNetwork, codec: PoseCodec, variables: Variables, inputs: PoseInputs[Array], key: Array) -> Action:
-    return from_vectors(network.answer(variables, inputs, key)[:, 0], codec)
+    return first_keyframe(network.answer(variables, inputs, key), inputs, codec)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +205,7 @@ class PoseOnDevice:
         near = keypoints if self.policy.config.wants_keypoints else None
         inputs = pose_inputs(observation.picture, observation.robot, question, near)
         vectors = self.policy.network.answer(variables, inputs, jax.random.key(ANSWER_SEED))
-        action = from_vectors(vectors[:, 0], self.policy.codec)
+        action = first_keyframe(vectors, inputs, self.policy.codec)
         action = Action(action.pose[:, : self.arms], action.gripper_open[:, : self.arms])
         return action, action
 

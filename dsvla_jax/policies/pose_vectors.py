@@ -1,8 +1,9 @@
 """Keyframes as vectors that a network can regress or denoise.
 
-A vector has ten numbers for an arm: the position, -1 to 1 over the box that positions are counted in; the first two
-columns of the rotation matrix, one after the other (Zhou et al. 2019, "On the Continuity of Rotation Representations in
-Neural Networks", section 4.2); and the gripper, 1 for open and -1 for closed.
+A vector has ten numbers for an arm: the position from an origin, in half sides of the box that positions are counted
+in; the first two columns of the rotation matrix, one after the other (Zhou et al. 2019, "On the Continuity of Rotation
+Representations in Neural Networks", section 4.2); and the gripper, 1 for open and -1 for closed. The origin of an
+answer is where the arm is, so that an answer stays the same when the world is shifted.
 """
 
 import jax.numpy as jnp
@@ -16,24 +17,37 @@ VECTOR = 10
 POSITION, ROTATION, GRIPPER = slice(0, 3), slice(3, 9), 9
 
 
-def scale_position(position: Float[Array, "*b 3"], codec: PoseCodec) -> Float[Array, "*b 3"]:
-    """Positions in metres -> -1 to 1 over the codec's box."""
-    low, high = jnp.array(codec.low), jnp.array(codec.high)
-    return (position - low) / (high - low) * 2 - 1
+def center(codec: PoseCodec) -> Float[Array, "3"]:
+    """The middle of the codec's box, metres, world frame."""
+    return jnp.array([(low + high) / 2 for low, high in zip(codec.low, codec.high, strict=True)])
 
 
-def to_vectors(pose: Float[Array, "*b 7"], gripper_open: Float[Array, "*b"], codec: PoseCodec) -> Float[Array, "*b 10"]:
+def half_sides(codec: PoseCodec) -> Float[Array, "3"]:
+    """Half of each side of the codec's box, metres."""
+    return jnp.array([(high - low) / 2 for low, high in zip(codec.low, codec.high, strict=True)])
+
+
+def scale_position(
+    position: Float[Array, "*b 3"], origin: Float[Array, "*c 3"], codec: PoseCodec
+) -> Float[Array, "*b 3"]:
+    """Positions in metres -> half sides of the codec's box from the origin."""
+    return (position - origin) / half_sides(codec)
+
+
+def to_vectors(
+    pose: Float[Array, "*b 7"], gripper_open: Float[Array, "*b"], origin: Float[Array, "*c 3"], codec: PoseCodec
+) -> Float[Array, "*b 10"]:
     """Keyframes -> vectors. A missing arm, whose pose is zeros, has the rotation of a quaternion of zeros."""
     matrix = quaternion_to_matrix(pose[..., 3:])
     columns = matrix[..., :2].swapaxes(-1, -2).reshape(*matrix.shape[:-2], 6)
     gripper = 2 * gripper_open[..., None] - 1
-    return jnp.concatenate([scale_position(pose[..., :3], codec), columns, gripper], axis=-1)
+    return jnp.concatenate([scale_position(pose[..., :3], origin, codec), columns, gripper], axis=-1)
 
 
-def from_vectors(vectors: Float[Array, "*b 10"], codec: PoseCodec) -> Action[Array]:
-    """The nearest keyframes: positions inside the box, columns made orthonormal, the gripper open above 0."""
-    low, high = jnp.array(codec.low), jnp.array(codec.high)
-    position = low + (jnp.clip(vectors[..., POSITION], -1, 1) + 1) / 2 * (high - low)
+def from_vectors(vectors: Float[Array, "*b 10"], origin: Float[Array, "*c 3"], codec: PoseCodec) -> Action[Array]:
+    """The nearest keyframes: positions moved into the box, columns made orthonormal, the gripper open above 0."""
+    position = origin + vectors[..., POSITION] * half_sides(codec)
+    position = jnp.clip(position, jnp.array(codec.low), jnp.array(codec.high))
     first, second = jnp.split(vectors[..., ROTATION], 2, axis=-1)
     first = normalize(first)
     second = normalize(second - jnp.sum(first * second, axis=-1, keepdims=True) * first)
