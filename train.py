@@ -164,9 +164,12 @@ def train(
     def validate(state: TrainState, _: Callable[[], bool]) -> dict[str, float]:
         return mean_errors(sums, state.trainable, frozen, held_out(), mesh)
 
+    def simulate(task: str) -> Environment:
+        return Environment(task, image_size=experiment.data.image_size, cameras=experiment.data.cameras)
+
     @cache
     def environments() -> dict[str, Environment]:
-        return {name: Environment(name, image_size=experiment.data.image_size) for name in experiment.data.tasks}
+        return {name: simulate(name) for name in experiment.data.tasks}
 
     def evaluate(state: TrainState, stop: Callable[[], bool]) -> dict[str, float]:
         policy = Policy(config, join_variables(state.trainable, frozen), tokenizer)

@@ -190,6 +190,14 @@ class Experiment:
         if self.oxe is not None:
             require(bool(self.oxe.mixture), "oxe.mixture", "a named mixture or names of datasets", self.oxe.mixture)
         require_same_sizes(self.encoding, self.model)
+        cameras = ("the only one",) if self.oxe is not None else self.data.cameras
+        require(
+            self.model.cameras == len(cameras),
+            "model.cameras",
+            f"{len(cameras)}, as many as there are to learn from ({', '.join(cameras)})",
+            self.model.cameras,
+            f"use --model.cameras {len(cameras)}" + (", or other --data.cameras" if self.oxe is None else ""),
+        )
         adapters = self.regime == "full" or self.model.lora is not None
         require(adapters, "regime", "'full' without adapters", repr(self.regime), "give the config a model.lora")
         require(

@@ -27,6 +27,7 @@ from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer, 
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.encoding.text import Tokenizer, quoted, unknown_words
 from dsvla_jax.errors import UserError
+from dsvla_jax.json_values import Json
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoded, Decoding, decode_actions
 from dsvla_jax.model.partition import shardings
@@ -90,7 +91,7 @@ def _decode(
     text: Text[Array],
     key: Array | None,
 ) -> Decoded:
-    inputs = model_inputs(observation.picture, text, config.encoding)
+    inputs = model_inputs(observation.pictures, text, config.encoding)
     grammar = build_answer_grammar(tokenizer, observation.robot.pose.shape[1], config.encoding.style)
     return decode_actions(VLA(config.model), variables, inputs, grammar, decoding, key)
 
@@ -195,9 +196,17 @@ def load_policy_config(run: Path) -> PolicyConfig:
             f"{run}: no run here (policy.json is missing); train one: python train.py CONFIG --run {run}"
         )
     try:
-        return read_config(file, PolicyConfig, "a policy")
+        return read_config(file, PolicyConfig, "a policy", _name_cameras)
     except UserError as error:
         raise CheckpointError(f"{error}; train the run again") from error
+
+
+def _name_cameras(fields: dict[str, Json]) -> None:
+    """Turns the name of the only camera, which earlier versions kept, into names of cameras."""
+    learned = fields.get("learned_from")
+    if isinstance(learned, dict) and "camera" in learned:
+        name = learned.pop("camera")
+        learned["cameras"] = [name] if name else []
 
 
 def load_vocabulary(run: Path, config: PolicyConfig) -> Tokenizer:

@@ -21,7 +21,7 @@ from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.loop import KeypointSource, policy_step
-from dsvla_jax.evaluation.outcome import EpisodeOutcome, camera_of, failure_reasons, is_over
+from dsvla_jax.evaluation.outcome import EpisodeOutcome, failure_reasons, is_over, views_of
 from dsvla_jax.model.decode import GREEDY, Decoding, decode_actions
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import VLA
@@ -90,7 +90,7 @@ def device_loop(
                 near = encoding.codec.encode_position(active).reshape(batch, -1)
                 integers = jnp.concatenate([integers, near], axis=1)
             prompts = Text(*write_prompts(table, beginnings, lengths, integers, size, tokenizer.pad_id))
-            inputs = model_inputs(observation.picture, prompts, encoding)
+            inputs = model_inputs(observation.pictures, prompts, encoding)
             answer = decode_actions(VLA(config.model), variables, inputs, grammar, decoding, None).integers
             return encoding.codec.decode(answer), answer
 
@@ -179,7 +179,7 @@ class DeviceLoop:
         rollout = self.rollout(state, keypoints, first)
         integers, keyframes = np.asarray(rollout.integers), np.asarray(rollout.keyframes)
         targets = np.asarray(codec.decode(rollout.integers).pose)[..., :3]
-        last = np.asarray(environment.observe(rollout.state).picture.rgb)
+        last = views_of(environment.observe(rollout.state))
         style, instructions = self._policy.config.encoding.style, self._instructions(state, first)
         reasons = failure_reasons(environment, rollout.state)
         on_keyframe(int(keyframes.max()), int(np.sum(environment.success(rollout.state))))
@@ -193,8 +193,7 @@ class DeviceLoop:
                     keyframes=done,
                     instruction=instructions[i],
                     answers=[format_answer(integers[k, i], style) for k in range(done)],
-                    frames=[last[i]],
-                    camera=camera_of(rollout.state, i),
+                    views=[last[i]],
                     targets=[targets[k, i] for k in range(done)],
                 )
             )

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import traverse_util
 
 PROJECTOR = "projector"
+CAMERA_EMBEDDING = "camera_embedding"
 
 # Parameters that are cast to the model's dtype before anything is computed with them. Norms and positions are not.
 MATRICES = ("kernel", "embedding", "output", "projection", "patch_kernel")
@@ -22,6 +23,7 @@ def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Va
 
     `full`: everything learns. `lora`: the "lora" collection and the projector learn (paper, section 3.1). `adapters`:
     the "lora" collection alone, on a base whose projector is pretrained (as in the authors' released training code).
+    The embeddings of several cameras learn always: no pretrained model has them.
     """
     flat = traverse_util.flatten_dict(variables)
 
@@ -30,9 +32,9 @@ def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Va
             case "full":
                 return True
             case "lora":
-                return path[0] == "lora" or path[1] == PROJECTOR
+                return path[0] == "lora" or path[1] == PROJECTOR or path[-1] == CAMERA_EMBEDDING
             case "adapters":
-                return path[0] == "lora"
+                return path[0] == "lora" or path[-1] == CAMERA_EMBEDDING
             case _:
                 assert_never(regime)
 

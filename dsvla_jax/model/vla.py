@@ -57,8 +57,8 @@ class VLA(nn.Module):
         self.language = Llama(self.config)
 
     def encode_vision(self, inputs: ModelInputs) -> Array:
-        """The vision tower's outputs (B, 1 + N + G, vision output width), ordered [CLS | 2D | 3D]."""
-        return self.vision(inputs.image, inputs.point_tokens, inputs.point_patches)
+        """The vision tower's outputs (B, 1 + C N + G, vision output width), ordered [CLS | 2D | 3D]."""
+        return self.vision(inputs.images, inputs.point_tokens, inputs.point_patches)
 
     def hidden(self, inputs: ModelInputs, text_from: int = 0) -> Array:
         """Hidden states (B, T - text_from, width) of the text positions from ``text_from`` on."""
@@ -162,7 +162,7 @@ def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Arra
     """
     vision, language = config.vision, config.language
     inputs = ModelInputs(
-        image=jnp.zeros((1, vision.image_size, vision.image_size, 3)),
+        images=jnp.zeros((1, config.cameras, vision.image_size, vision.image_size, 3)),
         point_tokens=jnp.zeros((1, 1, vision.width)),
         point_patches=jnp.zeros((1, 1), jnp.int32),
         text=Text(jnp.zeros((1, 2), jnp.int32), jnp.ones((1, 2), bool)),

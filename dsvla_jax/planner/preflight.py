@@ -35,7 +35,7 @@ def check_step(experiment: Experiment, mesh: Mesh, picture: tuple[int, int]) -> 
     batch = abstract_batch(experiment, mesh, picture)
 
     def logits(trainable: Variables, frozen: Variables, batch: Example[Array]) -> object:
-        inputs = model_inputs(batch.picture, batch.text, experiment.encoding)
+        inputs = model_inputs(batch.pictures, batch.text, experiment.encoding)
         return VLA(experiment.model).apply(join_variables(trainable, frozen), inputs)
 
     largest = max(_outputs(jax.make_jaxpr(logits)(state.trainable, frozen, batch).jaxpr), key=_bytes)

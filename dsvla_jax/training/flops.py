@@ -47,14 +47,14 @@ def model_flops(experiment: Experiment) -> int:
 
 
 def prefill_flops(experiment: Experiment) -> dict[str, int]:
-    """Of reading one example's picture and prompt before an answer is decoded; the logits of one position."""
+    """Of reading one example's pictures and prompt before an answer is decoded; the logits of one position."""
     return _flops(experiment, experiment.encoding.max_text_length, "inference")
 
 
 def _flops(experiment: Experiment, text: int, passes: Passes) -> dict[str, int]:
     config, full = experiment.model, experiment.regime == "full"
     vision, language, prompt = config.vision, config.language, config.visual_prompt
-    patches = vision.num_patches
+    patches = config.cameras * vision.num_patches
     tokens = 1 + patches + experiment.encoding.num_point_tokens
     training = passes == "training"
 

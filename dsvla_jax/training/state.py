@@ -14,7 +14,7 @@ from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.number_targets import NumberTargets
 from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.model.partition import constrain, shardings
-from dsvla_jax.model.variables import Variables, join_variables, narrow_frozen, split_variables
+from dsvla_jax.model.variables import CAMERA_EMBEDDING, Variables, join_variables, narrow_frozen, split_variables
 from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.training.objective import answer_counts, answer_loss
 from dsvla_jax.types import Array, Example
@@ -55,8 +55,12 @@ def initial_state(
         more = experiment.model.language.vocab_size - len(number_values)
         number_values = np.pad(number_values, (0, more), constant_values=np.nan)
     variables = initialize(experiment.model, jax.random.key(experiment.seed), number_values)
+    embedding = variables["params"]["vision"].get(CAMERA_EMBEDDING)
     for collection, towers in (base or {}).items():
         variables[collection] = {**variables[collection], **towers}
+    if embedding is not None:
+        # A base that reads one camera has none.
+        variables["params"]["vision"] = {CAMERA_EMBEDDING: embedding, **variables["params"]["vision"]}
     trainable, frozen = split_variables(variables, experiment.regime)
     state = start_state(trainable, optimizer, experiment.seed)
     return state, narrow_frozen(frozen, experiment.model.frozen_dtype)
@@ -103,7 +107,7 @@ def make_train_step(
 
         def part(batch: Example[Array]) -> tuple[Variables, dict[str, Array]]:
             batch = jax.tree.map(lambda leaf: constrain(leaf, "batch"), batch)
-            inputs = model_inputs(batch.picture, batch.text, experiment.encoding)
+            inputs = model_inputs(batch.pictures, batch.text, experiment.encoding)
 
             def loss_of(trainable: Variables):
                 dropout = jax.random.fold_in(state.rng, state.step)

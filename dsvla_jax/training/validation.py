@@ -43,7 +43,7 @@ def jit_validation(experiment: Experiment, targets: NumberTargets, mesh: Mesh) -
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
             batch = jax.tree.map(lambda leaf: constrain(leaf, "batch"), batch)
             example = batch.example
-            inputs = model_inputs(example.picture, example.text, experiment.encoding)
+            inputs = model_inputs(example.pictures, example.text, experiment.encoding)
             logits: Any = model.apply(join_variables(trainable, frozen), inputs)
             one = jnp.ones((), jnp.int32)
             loss, _ = answer_loss(logits, example, targets, (one, one))
