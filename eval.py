@@ -25,7 +25,7 @@ from dsvla_jax.evaluation.conditions import Conditions
 from dsvla_jax.evaluation.device_loop import DeviceLoop
 from dsvla_jax.evaluation.loop import on_host, run_task
 from dsvla_jax.evaluation.outcome import EpisodeOutcome
-from dsvla_jax.evaluation.pictures import film_strip, mark_targets
+from dsvla_jax.evaluation.pictures import film_strip, mark_view
 from dsvla_jax.evaluation.report import print_comparison, print_table, write_report
 from dsvla_jax.evaluation.results import (
     EpisodeResult,
@@ -202,7 +202,11 @@ def evaluate_task(
 ) -> list[EpisodeOutcome]:
     """All episodes of one task, ``options.batch`` of them side by side."""
     environment = Environment(
-        name, physics=options.physics, image_size=experiment.data.image_size, shifts=options.shift
+        name,
+        physics=options.physics,
+        image_size=experiment.data.image_size,
+        shifts=options.shift,
+        cameras=experiment.data.cameras,
     )
     on_device = options.loop == "device"
     return run_task(
@@ -227,10 +231,10 @@ def save_strips(folder: Path, task: str, outcomes: Sequence[EpisodeOutcome]) -> 
     """Writes the film strip of every episode, each target marked in the frame it was answered to."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, outcome in enumerate(outcomes):
-        *seen, last = outcome.frames
+        *seen, last = outcome.views
         # The loop on the device keeps the last view alone.
-        marked = [mark_targets(f, t, outcome.camera) for f, t in zip(seen, outcome.targets, strict=bool(seen))]
-        write_picture(strip_file(folder, task, i), film_strip([*marked, last]))
+        marked = [mark_view(v.rgb, t, v.camera) for v, t in zip(seen, outcome.targets, strict=bool(seen))]
+        write_picture(strip_file(folder, task, i), film_strip([*marked, mark_view(last.rgb, None, last.camera)]))
 
 
 def load_strips(folder: Path, results: Sequence[EpisodeResult]) -> dict[tuple[str, int], list[np.ndarray]]:

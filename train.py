@@ -138,7 +138,12 @@ def train(
     held_out = open_validation_data(experiment, tokenizer, part)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     learner = make_learner(
-        experiment.baseline, experiment.encoding, experiment.model, tokenizer, experiment.soft_target_sigma
+        experiment.baseline,
+        experiment.encoding,
+        experiment.model,
+        tokenizer,
+        experiment.soft_target_sigma,
+        experiment.num_cameras,
     )
     average = experiment.optimizer.average_decay
     start = partial(
@@ -179,9 +184,12 @@ def train(
     def validate(state: TrainState, _: Callable[[], bool]) -> dict[str, float]:
         return mean_errors(sums, state.acting, frozen, held_out(), mesh)
 
+    def simulate(task: str) -> Environment:
+        return Environment(task, image_size=experiment.data.image_size, cameras=experiment.data.cameras)
+
     @cache
     def environments() -> dict[str, Environment]:
-        return {name: Environment(name, image_size=experiment.data.image_size) for name in experiment.data.tasks}
+        return {name: simulate(name) for name in experiment.data.tasks}
 
     def evaluate(state: TrainState, stop: Callable[[], bool]) -> dict[str, float]:
         policy = make_policy(config, join_variables(state.acting, frozen), tokenizer)

@@ -23,6 +23,7 @@ from dsvla_jax.serving.batching import Question, answer_batch
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
+from dsvla_jax.types import split_cameras
 
 
 @contextlib.contextmanager
@@ -80,13 +81,14 @@ def known_answers(run: Path, episodes: int) -> list[Known]:
         keypoints = np.asarray(environment.keypoints(state))
         for i, instruction in enumerate(environment.instructions(state, np.arange(episodes))):
             one = jax.tree.map(lambda x, i=i: x[i], seen)
+            (picture,) = split_cameras(one.pictures)
             (answer,) = answer_batch(policy, [Question(instruction, one, keypoints[i, :, 0])])
             request = {
                 "prompt": instruction,
-                "rgb": one.picture.rgb,
-                "depth": one.picture.depth,
-                "intrinsics": one.picture.camera.intrinsics,
-                "world_from_camera": one.picture.camera.world_from_camera,
+                "rgb": picture.rgb,
+                "depth": picture.depth,
+                "intrinsics": picture.camera.intrinsics,
+                "world_from_camera": picture.camera.world_from_camera,
                 "pose": one.robot.pose,
                 "gripper_open": one.robot.gripper_open,
                 "keypoints": keypoints[i, :, :1],

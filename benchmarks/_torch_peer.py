@@ -55,7 +55,7 @@ class TorchVLA(torch.nn.Module):
     def forward(self, inputs: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Logits of the text positions."""
         vision, language = self.vision, self.language
-        tokens_2d = vision.embeddings(inputs["image"])
+        tokens_2d = vision.embeddings(inputs["images"])
         tokens_3d = inputs["point_tokens"] + vision.embeddings.position_embedding.weight[1 + inputs["point_patches"]]
         x = vision.pre_layrnorm(torch.cat([tokens_2d, tokens_3d], dim=1))
         x = vision.post_layernorm(vision.encoder(inputs_embeds=x).last_hidden_state)
@@ -101,10 +101,10 @@ def as_torch(variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def torch_inputs(inputs: ModelInputs) -> dict[str, torch.Tensor]:
-    """Our batch, the image with channels first."""
+    """Our batch of one camera, its image with channels first."""
     arrays = {name: np.array(value) for name, value in named_arrays(inputs).items()}
     tensors = {
         name: torch.from_numpy(value if value.dtype != np.int32 else value.astype(np.int64))
         for name, value in arrays.items()
     }
-    return tensors | {"image": tensors["image"].permute(0, 3, 1, 2).contiguous()}
+    return tensors | {"images": tensors["images"][:, 0].permute(0, 3, 1, 2).contiguous()}

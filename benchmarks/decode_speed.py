@@ -120,7 +120,7 @@ def main(options: Options) -> int:
     text, _ = encode_text(tokenizer, prompt, None, 512)
     length = int(text.mask.sum())
     inputs = ModelInputs(
-        image=jnp.ones((1, 16, 16, 3)),
+        images=jnp.ones((1, 1, 16, 16, 3)),
         point_tokens=jnp.zeros((1, 0, 32)),
         point_patches=jnp.zeros((1, 0), jnp.int32),
         text=jax.tree.map(lambda leaf: jnp.asarray(leaf[None, :length]), text),

@@ -68,7 +68,7 @@ def malformed(kind: str, style: Style, arms: int, options: Options) -> tuple[int
         rng = np.random.default_rng(trial)
         lengths = rng.integers(1, 10, BATCH)
         inputs = ModelInputs(
-            image=jnp.asarray(rng.normal(size=(BATCH, 16, 16, 3)), jnp.float32),
+            images=jnp.asarray(rng.normal(size=(BATCH, 1, 16, 16, 3)), jnp.float32),
             point_tokens=jnp.asarray(rng.normal(size=(BATCH, 3, WIDTH)), jnp.float32),
             point_patches=jnp.asarray(rng.integers(0, 4, (BATCH, 3)), jnp.int32),
             text=Text(

@@ -47,7 +47,7 @@ def run_expert(environment: Environment, keys: jax.Array, film: Path | None = No
         ends["wrong variation"] = environment.follow(start, environment.expert(other))[-1]
     if film:
         film.mkdir(parents=True, exist_ok=True)
-        pictures = np.stack([np.asarray(environment.observe(s).picture.rgb)[:4] for s in states], axis=1)
+        pictures = np.stack([np.asarray(environment.render(s).rgb)[:4] for s in states], axis=1)
         rows = [np.concatenate(list(row), axis=1) for row in pictures]
         write_picture(film / f"{environment.task.name}.png", np.concatenate(rows))
     return {name: np.asarray(environment.success(end)) for name, end in ends.items()}

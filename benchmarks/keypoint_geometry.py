@@ -85,13 +85,14 @@ def measure(name: str, options: Options) -> tuple[list[float], int, list[float]]
     """Metres of every keypoint, how many have a surface centre, and metres of the first to the task's own first one."""
     environment = Environment(name, image_size=options.image_size)
     state = environment.reset(episode_keys(0, "validation", name, 0, options.episodes))
-    masks, seen = object_masks(environment, state), environment.observe(state)
+    seen = environment.render(state)
+    masks = object_masks(environment, state, seen)
     own = np.asarray(environment.keypoints(state))
     errors, solids, to_own = [], 0, []
     for i in range(options.episodes):
         one: Any = jax.tree.map(lambda x, i=i: np.asarray(x)[i], state)
         task = environment.task
-        phrases, depth = task.phrases(task.words(int(one.variation)))[0], np.asarray(seen.picture.depth)[i]
+        phrases, depth = task.phrases(task.words(int(one.variation)))[0], np.asarray(seen.depth)[i]
         sightings = [
             locate(Sighting(phrase, mask), depth, one.camera) for phrase, mask in zip(phrases, masks[i], strict=True)
         ]
@@ -107,7 +108,7 @@ def measure(name: str, options: Options) -> tuple[list[float], int, list[float]]
             to_own.append(float(np.linalg.norm(sightings[0].point - own[i, 0, 0])))
         if options.out:
             options.out.mkdir(parents=True, exist_ok=True)
-            picture = draw_sightings(np.asarray(seen.picture.rgb)[i], sightings)
+            picture = draw_sightings(np.asarray(seen.rgb)[i], sightings)
             write_picture(options.out / f"{name}-{i}.png", picture)
     return errors, solids, to_own
 

@@ -72,7 +72,7 @@ def ours(folder: Path, frames: int, passes: int = 1) -> dict:
     config = OxeConfig(folder=str(folder), mixture=(NAME,), image_size=SIZE, crop=CROP, streams=1)
     encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64, use_points=False)
     loader = OxeLoader(config, encoding, suite_tokenizer(), batch_size=BATCH, seed=0, progress=False)
-    return measure((example.picture.rgb for example in loader), frames, passes)
+    return measure((example.pictures.rgb for example in loader), frames, passes)
 
 
 def demonstrations(folder: Path, frames: int, passes: int = 1) -> dict:
@@ -88,13 +88,14 @@ def demonstrations(folder: Path, frames: int, passes: int = 1) -> dict:
     encoding = EncodingConfig(image_size=SIZE, style="compact", max_text_length=64)
     sample = make_sampler(data, encoding, suite_tokenizer())
     loader = make_loader(EpisodeReader(folder), sample, batch_size=BATCH, seed=0)
-    return measure((example.picture.rgb for example in loader), frames, passes)
+    return measure((example.pictures.rgb for example in loader), frames, passes)
 
 
 def write_demonstrations(folder: Path, episodes: int, frames: int) -> None:
     """Demonstrations of one arm with pictures of noise."""
     from data_pipelines.episodes import write_episodes
     from data_pipelines.records import make_episode
+    from dsvla_jax.types import Camera, Picture
 
     rng = np.random.default_rng(0)
 
@@ -109,10 +110,14 @@ def write_demonstrations(folder: Path, episodes: int, frames: int) -> None:
             task="lamp_on",
             instruction="turn on the light",
             seed=number,
-            rgb=rng.integers(0, 256, (frames, SIZE, SIZE, 3), np.uint8),
-            depth=rng.uniform(0.5, 1.5, (frames, SIZE, SIZE)),
-            intrinsics=[[SIZE, 0, SIZE / 2], [0, SIZE, SIZE / 2], [0, 0, 1]],
-            world_from_camera=camera,
+            pictures=[
+                Picture(
+                    rng.integers(0, 256, (1, SIZE, SIZE, 3), np.uint8),
+                    rng.uniform(0.5, 1.5, (1, SIZE, SIZE)),
+                    Camera(np.array([[[SIZE, 0, SIZE / 2], [0, SIZE, SIZE / 2], [0, 0, 1]]]), camera[None]),
+                )
+                for _ in range(frames)
+            ],
             pose=pose,
             gripper_open=np.ones((frames, 1)),
             target_pose=pose,

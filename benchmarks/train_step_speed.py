@@ -41,7 +41,7 @@ def make_inputs() -> tuple[ModelInputs, jax.Array]:
     rng = np.random.default_rng(0)
     vision, size = CONFIG.vision, CONFIG.vision.image_size
     inputs = ModelInputs(
-        image=jnp.asarray(rng.normal(size=(BATCH, size, size, 3)), jnp.float32),
+        images=jnp.asarray(rng.normal(size=(BATCH, 1, size, size, 3)), jnp.float32),
         point_tokens=jnp.asarray(rng.normal(size=(BATCH, POINTS, vision.width)), jnp.float32),
         point_patches=jnp.asarray(rng.integers(0, vision.num_patches, (BATCH, POINTS)), jnp.int32),
         text=Text(

@@ -13,7 +13,7 @@ import numpy as np
 
 from data_pipelines.pictures import random_box
 from data_pipelines.records import Frame
-from dsvla_jax.types import Picture
+from dsvla_jax.types import Picture, join_cameras, split_cameras
 
 
 def random_offset(
@@ -29,20 +29,20 @@ def random_offset(
 
 
 def shift_world(frame: Frame, offset: np.ndarray) -> Frame:
-    """Moves everything, the camera too, by offset (3,) metres: the picture stays as it is, its coordinates change.
+    """Moves everything, the cameras too, by offset (3,) metres: pictures stay as they are, coordinates change.
 
-    A point cloud made from the shifted camera is shifted as well. A crop box in world coordinates is not, so prefer
+    A point cloud made from the shifted cameras is shifted as well. A crop box in world coordinates is not, so prefer
     horizontal offsets where the cloud is cropped at the height of the table.
     """
     offset = np.asarray(offset, np.float32)
     if offset.shape != (3,):
         raise ValueError(f"offset: expected shape (3,), got {offset.shape}; give one number an axis")
-    world_from_camera = frame.picture.camera.world_from_camera.copy()
-    world_from_camera[:3, 3] += offset
-    camera = replace(frame.picture.camera, world_from_camera=world_from_camera)
+    world_from_camera = frame.pictures.camera.world_from_camera.copy()
+    world_from_camera[:, :3, 3] += offset
+    camera = replace(frame.pictures.camera, world_from_camera=world_from_camera)
     return replace(
         frame,
-        picture=replace(frame.picture, camera=camera),
+        pictures=replace(frame.pictures, camera=camera),
         robot=replace(frame.robot, pose=_move(frame.robot.pose, offset)),
         target=replace(frame.target, pose=_move(frame.target.pose, offset)),
         later=frame.later and replace(frame.later, pose=_move(frame.later.pose, offset)),
@@ -69,13 +69,13 @@ def perturb_keypoint(frame: Frame, rng: np.random.Generator, max_offset: float, 
     return replace(frame, keypoint=frame.keypoint + noise)
 
 
-def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
-    """The frame as seen through a window of its picture, at the picture's own size again.
+def crop(picture: Picture[np.ndarray], top: int, left: int, height: int, width: int) -> Picture[np.ndarray]:
+    """One picture as seen through a window of it, at its own size again.
 
     Colour is interpolated, depth is the nearest pixel's, and the intrinsics move along, so that every reading stays at
     its place in the world to half a pixel of the picture; poses and keypoints are in the world and stay.
     """
-    rows, columns = frame.picture.depth.shape
+    rows, columns = picture.depth.shape
     inside = top >= 0 and left >= 0 and top + height <= rows and left + width <= columns
     if not inside or min(height, width) < 2:
         raise ValueError(f"crop: expected a window within {rows} x {columns}, got {(top, left, height, width)}")
@@ -84,37 +84,42 @@ def crop(frame: Frame, top: int, left: int, height: int, width: int) -> Frame:
     u, v = left + np.arange(columns) * scale[0], top + np.arange(rows) * scale[1]
     across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
     nearest = np.ix_(np.rint(v).astype(int), np.rint(u).astype(int))
-    intrinsics = frame.picture.camera.intrinsics.copy()
+    intrinsics = picture.camera.intrinsics.copy()
     intrinsics[:2, 2] -= [left, top]
     intrinsics[:2] /= scale[:, None]
-    picture = Picture(
-        rgb=cv2.remap(frame.picture.rgb, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-        depth=frame.picture.depth[nearest],
-        camera=replace(frame.picture.camera, intrinsics=intrinsics),
+    return Picture(
+        rgb=cv2.remap(picture.rgb, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        depth=picture.depth[nearest],
+        camera=replace(picture.camera, intrinsics=intrinsics),
     )
-    return replace(frame, picture=picture)
 
 
 def random_crop(frame: Frame, rng: np.random.Generator, least: float) -> Frame:
-    """A random window whose sides are a share of the picture's between `least` and 1; see `crop`."""
-    rows, columns = frame.picture.depth.shape
-    return crop(frame, *random_box(rng, rows, columns, least))
+    """A random window of each camera's picture, whose sides are a share between `least` and 1 of its; see `crop`."""
+    rows, columns = frame.pictures.depth.shape[1:]
+    cropped = [crop(one, *random_box(rng, rows, columns, least)) for one in split_cameras(frame.pictures)]
+    return replace(frame, pictures=join_cameras(cropped))
 
 
 def vary_colour(frame: Frame, rng: np.random.Generator, strength: float = 0.15) -> Frame:
+    """Varies the colours of each camera's picture, see `_vary`. strength: relative."""
+    rgb = np.stack([_vary(one, rng, strength) for one in frame.pictures.rgb])
+    return replace(frame, pictures=replace(frame.pictures, rgb=rgb))
+
+
+def _vary(rgb: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
     """Random brightness, contrast and saturation of up to ±strength, and a hue turn of up to strength * 20 degrees.
 
-    The hue turn stays small because instructions name colours.
+    The hue turn stays small because instructions name colours. rgb: uint8 (H, W, 3).
     """
     brightness, contrast, saturation = 1 + rng.uniform(-strength, strength, 3)
     hue = rng.uniform(-strength, strength) * 20
-    hsv = cv2.cvtColor(frame.picture.rgb.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
+    hsv = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2HSV)
     hsv[..., 0] = (hsv[..., 0] + hue) % 360
     hsv[..., 1] = np.clip(hsv[..., 1] * saturation, 0, 1)
-    rgb = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB) * brightness
-    rgb = (rgb - rgb.mean()) * contrast + rgb.mean()
-    rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    return replace(frame, picture=replace(frame.picture, rgb=rgb))
+    varied = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB) * brightness
+    varied = (varied - varied.mean()) * contrast + varied.mean()
+    return np.rint(np.clip(varied, 0, 1) * 255).astype(np.uint8)
 
 
 def _move(poses: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import dataclasses
 import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,7 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.files import hold_folder
 from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.ranges import Range, at_least, check_fields, require
+from dsvla_jax.sim.cameras import FRONT, check_cameras
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
@@ -48,6 +50,9 @@ class Settings:
 
     image_size: int = 96
     """Rendered pixels a side."""
+    cameras: tuple[str, ...] = (FRONT,)
+    """Names of the cameras to record, in this order: front, left_shoulder, right_shoulder, overhead and wrist, of two
+    arms wrist_left and wrist_right."""
     seed: int = 0
     """Seed; another number gives other demonstrations."""
     split: Literal["train", "validation", "eval"] = "train"
@@ -65,6 +70,13 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_fields(self, "", **self._ranges())
+
+    def as_written(self) -> dict[str, Any]:
+        """The settings that an index keeps. That a folder has the front camera alone is not written."""
+        written = dataclasses.asdict(self)
+        if self.cameras == (FRONT,):
+            del written["cameras"]
+        return written
 
     def _ranges(self) -> dict[str, Range]:
         return {
@@ -99,7 +111,9 @@ class ScriptedExpert:
     def __init__(self, task: str, settings: Settings) -> None:
         self.task = get_task(task)
         self.settings = settings
-        self.environment = Environment(self.task, physics="mujoco", image_size=settings.image_size)
+        self.environment = Environment(
+            self.task, physics="mujoco", image_size=settings.image_size, cameras=settings.cameras
+        )
         self._replay_latch = jax.jit(jax.vmap(replay_latch))
 
     def __call__(self, start: int, count: int) -> list[Episode | None]:
@@ -146,16 +160,14 @@ class ScriptedExpert:
                     task=self.task.name,
                     instruction=instructions[i],
                     seed=start + i,
-                    rgb=[x.picture.rgb for x in seen],
-                    depth=[mark_missing(x.picture.depth) for x in seen],
-                    intrinsics=np.stack([x.picture.camera.intrinsics for x in seen]),
-                    world_from_camera=np.stack([x.picture.camera.world_from_camera for x in seen]),
+                    pictures=[replace(x.pictures, depth=mark_missing(x.pictures.depth)) for x in seen],
                     pose=np.stack([x.robot.pose for x in seen]),
                     gripper_open=np.stack([x.robot.gripper_open for x in seen]),
                     target_pose=poses[i, :frames],
                     target_gripper=grippers[i, :frames],
                     keypoints=keypoints[i],
                     active_keypoint=active[i, :frames],
+                    cameras=settings.cameras,
                 )
             )
         return episodes
@@ -205,7 +217,9 @@ def generate_demonstrations(
     folder = Path(folder)
 
     def shards() -> dict[str, dict[str, Any]]:
-        return {entry["file"]: entry for entry in existing_shards(folder, dataclasses.asdict(wanted))}
+        made_with = {**dataclasses.asdict(wanted), "cameras": list(wanted.cameras)}
+        assumed = {"cameras": [FRONT]}
+        return {entry["file"]: entry for entry in existing_shards(folder, made_with, assumed)}
 
     entries = shards()
     with contextlib.ExitStack() as stack:
@@ -239,7 +253,7 @@ def _make_missing(
             made, attempts = made + successes, attempts + tried
             if tried:
                 entries[entry["file"]] = entry
-                write_index(folder, [entries[key] for key in sorted(entries)], dataclasses.asdict(wanted))
+                write_index(folder, [entries[key] for key in sorted(entries)], wanted.as_written())
             bar.set_postfix_str(entry["task"])
             bar.update(len(entry["frames"]))
 
@@ -323,6 +337,8 @@ def is_usable(folder: Path, entry: dict[str, Any], needed: int, digest: bool = T
 def main(options: Options) -> None:
     """Generates what the options ask for."""
     tasks = select_tasks(options.tasks)
+    for task in tasks:
+        check_cameras(options.cameras, get_task(task).num_arms)
     settings = {field.name: getattr(options, field.name) for field in dataclasses.fields(Settings)}
     generate_demonstrations(options.out, tasks, options.episodes, workers=options.workers, **settings)
 

@@ -19,6 +19,7 @@ from data_pipelines.records import (
     decode_frame,
     pack_episode,
     picture_size,
+    select_cameras,
     unpack_episode,
 )
 from dsvla_jax.encoding.keypoints import REACHED_RADIUS
@@ -29,6 +30,7 @@ FORMAT_NAME = "dsvla-episodes"
 FORMAT_VERSION = 1
 INDEX_FILE = "index.json"
 
+_ONE_SET = "all episodes of a folder are seen by the same cameras: write a folder for each set of them"
 _ONE_SIZE = "pictures of unlike sizes do not batch: resize them (intrinsics too), or write a folder for each size"
 
 
@@ -48,6 +50,9 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
         raise ValueError(
             f"shard {name}: expected episodes of {task} alike, got {sorted(kinds)}; write one shard a task"
         )
+    cameras = sorted({episode.cameras for episode in episodes})
+    if len(cameras) > 1:
+        raise DataError(folder / name, "cameras", "the same for all", str(cameras), _ONE_SET)
     sizes = sorted({picture_size(png) for episode in episodes for png in (*episode.rgb_png, *episode.depth_png)})
     if len(sizes) > 1:
         raise DataError(folder / name, "picture size", "one (height, width) for all", str(sizes), _ONE_SIZE)
@@ -70,6 +75,7 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
         "instructions": sorted({episode.instruction for episode in episodes}),
         "bytes": (folder / name).stat().st_size,
         "sha256": file_digest(folder / name),
+        **({"cameras": list(cameras[0])} if cameras and cameras[0] else {}),
         **extra,
     }
 
@@ -106,6 +112,16 @@ def read_index(folder: Path) -> dict[str, Any]:
         fix = "make the data again: the keypoint of each frame was chosen by another distance than a policy's will be"
         raise DataError(path, "reached_radius", f"{REACHED_RADIUS} m", f"{found}", fix)
     return index
+
+
+def only_camera(index: dict[str, Any]) -> tuple[str, ...]:
+    """The name of the camera of a folder with a single one, as the contents of its index say; empty if they do not."""
+    settings = index["settings"]
+    if names := settings.get("cameras"):
+        return tuple(names)
+    # The demonstrations of the simulator name their cameras unless it is the front camera alone.
+    name = settings.get("camera") or ("front" if "perturb_probability" in settings else "")
+    return (name,) if name else ()
 
 
 def existing_shards(
@@ -171,9 +187,10 @@ class EpisodeReader:
 
     Opening checks that every shard is complete; ``verify="sha256"`` reads them all and compares digests too.
     Episodes and frames are numbered through all shards, task by task, in the order in which they were written.
-    `num_arms` is by task, `instructions` are those of the shards.
+    `num_arms` is by task, `instructions` are those of the shards, `cameras` the names of the cameras.
     tasks: which tasks, none twice; all if None. episodes: only the first so many of each task; all if None. skip:
-    without so many before them. `fewer`: whether a task may have fewer.
+    without so many before them. `fewer`: whether a task may have fewer. cameras: whose pictures to give, and in which
+    order; all if None. "front" also stands for the only camera of a folder, whatever its name.
     """
 
     def __init__(
@@ -184,9 +201,11 @@ class EpisodeReader:
         skip: int = 0,
         fewer: bool = False,
         verify: Literal["size", "sha256"] = "size",
+        cameras: Sequence[str] | None = None,
     ) -> None:
         self.folder = Path(folder)
         index = read_index(self.folder)
+        self.cameras, self._chosen = self._choose_cameras(index, cameras)
         present = sorted({entry["task"] for entry in index["shards"] if entry["frames"]})
         if missing := set(tasks or ()) - set(present):
             raise DataError(
@@ -213,6 +232,25 @@ class EpisodeReader:
         self._first_episode = np.cumsum([0] + [len(entry["frames"]) for entry in self._shards])
         self._first_frame = np.cumsum([0] + [count for entry in self._shards for count in entry["frames"]])
         self._open: dict[int, Any] = {}
+
+    def _choose_cameras(
+        self, index: dict[str, Any], wanted: Sequence[str] | None
+    ) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        """Returns the names of the cameras to give, and their numbers among those of the folder.
+
+        No name is known of some folders' only camera.
+        """
+        sets = {tuple(entry.get("cameras", ())) for entry in index["shards"] if entry["frames"]}
+        if len(sets) > 1:
+            raise DataError(self.folder, "cameras", "the same for all episodes", str(sorted(sets)), _ONE_SET)
+        names = next(iter(sets), ()) or only_camera(index)
+        if wanted is None or (len(names) <= 1 and tuple(wanted) == ("front",)):
+            return names, tuple(range(max(len(names), 1)))
+        if not wanted or not set(wanted) <= set(names) or len(set(wanted)) < len(wanted):
+            there = ", ".join(names) or "one camera, whose name is not known"
+            fix = "choose with data.cameras" if names else "leave data.cameras at front"
+            raise DataError(self.folder, "cameras", f"some of {there}, each once", ", ".join(wanted) or "none", fix)
+        return tuple(wanted), tuple(names.index(name) for name in wanted)
 
     def _choose(
         self, shards: Sequence[dict[str, Any]], task: str, episodes: int | None, skip: int, fewer: bool
@@ -265,7 +303,10 @@ class EpisodeReader:
             self._open[shard] = array_record_module.ArrayRecordReader(str(path), options="readahead_buffer_size:0")
         place = number - int(self._first_episode[shard]) + self._shards[shard]["first"]
         (record,) = self._open[shard].read([place])
-        return unpack_episode(record, f"{path}, episode {place}")
+        episode = unpack_episode(record, f"{path}, episode {place}")
+        if self._chosen == tuple(range(episode.num_cameras)):
+            return episode
+        return select_cameras(episode, self._chosen)
 
     def frames_of(self, task: str) -> range:
         """The numbers of a task's frames, which follow each other."""

@@ -42,13 +42,14 @@ class Options:
 def find(episode: Episode, segment: Segmenter, table: Sequence[ObjectPhrases]) -> tuple[Episode, list[Sighting]]:
     """The episode with the keypoints seen in its first picture, and the active ones of each frame; what was seen.
 
-    Raises KeypointsNotFound, and UserError where no phrases are known for the instruction.
+    Of several cameras, the first one's picture is looked at. Raises KeypointsNotFound, and UserError where no phrases
+    are known for the instruction.
     """
     arms = phrases_for(episode.instruction, table)
     if len(arms) not in (1, episode.num_arms):
         raise UserError(f"{episode.instruction!r}: its objects are for {len(arms)} arms, not {episode.num_arms}")
     arms = arms * (episode.num_arms // len(arms))
-    camera = Camera(episode.intrinsics[0], episode.world_from_camera[0])  # type: ignore[arg-type]
+    camera = Camera(episode.intrinsics[0, 0], episode.world_from_camera[0, 0])  # type: ignore[arg-type]
     rgb, depth = decode_rgb(episode.rgb_png[0]), decode_depth(episode.depth_png[0])
     keypoints, sightings = find_keypoints(segment, rgb, depth, camera, arms)
     return dataclasses.replace(

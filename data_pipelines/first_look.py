@@ -9,13 +9,14 @@ import numpy as np
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.records import Frame
 from data_pipelines.sources import open_demonstrations
-from data_pipelines.workspace import PointCount, View, fit_box, require_points
+from data_pipelines.workspace import PointCount, View, count_points, fit_box, require_points
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import is_constant
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.observation_checks import check_camera, check_pictures, has_words
+from dsvla_jax.types import split_cameras
 
 if TYPE_CHECKING:
     from data_pipelines.oxe.mixture import OpenDataset
@@ -33,8 +34,9 @@ def look_at_demonstrations(reader: EpisodeReader, encoding: EncodingConfig) -> s
     targets = [np.concatenate([x.target.pose, x.target.gripper_open[:, None]], axis=1) for x in frames]
     said = [say_words(reader), say_components(targets)]
     if encoding.use_points:
+        _require_each_camera(reader, frames, encoding)
         counts = [require_points(f"{reader.folder}, {task}", views, encoding) for task, views in views_of(frames)]
-        said.append(say_points(counts))
+        said.append(say_points(counts, len(frames[0].pictures.rgb)))
     return f"{reader.folder}: {'; '.join(said)}"
 
 
@@ -95,13 +97,34 @@ def views_of(frames: Sequence[Frame]) -> list[tuple[str, list[View]]]:
     views: dict[str, list[View]] = {}
     for frame in frames:
         where = f"{frame.task}, episode {frame.episode}, sample {frame.frame}"
-        picture, camera = frame.picture, frame.picture.camera
-        check_pictures(picture.rgb, picture.depth, where)
-        check_camera(camera.intrinsics, camera.world_from_camera, picture.rgb.shape[:2], where)
         hands = np.concatenate([frame.robot.pose[:, :3], frame.target.pose[:, :3]])
-        view = View(picture.depth, camera.intrinsics, camera.world_from_camera, hands)
-        views.setdefault(frame.task, []).append(view)
+        pictures = split_cameras(frame.pictures)
+        for number, picture in enumerate(pictures):
+            place = where if len(pictures) == 1 else f"{where}, camera {number}"
+            camera = picture.camera
+            check_pictures(picture.rgb, picture.depth, place)
+            check_camera(camera.intrinsics, camera.world_from_camera, picture.rgb.shape[:2], place)
+            view = View(picture.depth, camera.intrinsics, camera.world_from_camera, hands)
+            views.setdefault(frame.task, []).append(view)
     return list(views.items())
+
+
+def _require_each_camera(reader: EpisodeReader, frames: Sequence[Frame], encoding: EncodingConfig) -> None:
+    """Raises DataError if one of several cameras sees nothing of the workspace in all frames of a task.
+
+    One camera may see little of it, such as one on the wrist above an empty table: all together are what
+    `require_points` judges.
+    """
+    count = len(reader.cameras)
+    for task, views in views_of(frames) if count > 1 else ():
+        for number, name in enumerate(reader.cameras):
+            found = count_points(views[number::count], encoding)
+            if not found.inside:
+                box = f"a reading in the workspace from {encoding.workspace_low} to {encoding.workspace_high}"
+                fix = (
+                    "check its world_from_camera, intrinsics and the unit of its depth, or leave it out of data.cameras"
+                )
+                raise DataError(f"{reader.folder}, {task}", f"camera {name}", box, f"0 of {found.readings}", fix)
 
 
 def cloud_warnings(frames: Sequence[Frame], encoding: EncodingConfig) -> list[str]:
@@ -140,9 +163,9 @@ def dataset_views(opened: "OpenDataset") -> list[View]:
     return views
 
 
-def say_points(counts: Sequence[PointCount]) -> str:
-    """The mean number of points over some counts."""
-    views = sum(count.views for count in counts)
+def say_points(counts: Sequence[PointCount], cameras: int = 1) -> str:
+    """The mean number of points of a sample over some counts. cameras: views of each sample."""
+    views = sum(count.views for count in counts) // cameras
     inside, pixels = (sum(getattr(count, name) for count in counts) / views for name in ("inside", "pixels"))
     return f"{inside:,.0f} of {pixels:,.0f} points in the workspace (mean of {views} samples)"
 

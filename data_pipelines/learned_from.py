@@ -12,7 +12,7 @@ from dsvla_jax.data_config import DataConfig, LearnedFrom, OxeConfig
 def learned_from(data: DataConfig, use_keypoints: bool) -> LearnedFrom:
     """That of demonstrations that are on disk. use_keypoints: whether the policy's prompts state them."""
     tasks = choose_tasks(data)
-    reader = EpisodeReader(Path(data.folder), tasks=tasks, episodes=data.episodes, fewer=True)
+    reader = EpisodeReader(Path(data.folder), tasks=tasks, episodes=data.episodes, fewer=True, cameras=data.cameras)
     first = reader.episode(0)
     simulated = data.source == "simulator"
     known = simulated or _first_keypoints(data, tasks)
@@ -22,7 +22,7 @@ def learned_from(data: DataConfig, use_keypoints: bool) -> LearnedFrom:
         image_size=picture_size(first.rgb_png[0]),
         arms=tuple(sorted(set(reader.num_arms.values()))),
         tasks=tasks,
-        camera="front" if simulated else reader.settings.get("camera", ""),
+        cameras=reader.cameras,
     )
 
 

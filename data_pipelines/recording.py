@@ -5,7 +5,7 @@ found in and the fix: units, orders, sizes, cameras that look the other way, rot
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import jax
@@ -22,9 +22,26 @@ from dsvla_jax.observation_checks import (
     check_poses,
     has_words,
 )
+from dsvla_jax.types import Camera, Picture, join_cameras
 
 # Metres, and as much in a rotation matrix: a camera that moves less in a whole demonstration stands still.
 STANDS_STILL = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraRecording:
+    """What one camera recorded in T observations.
+
+    rgb: T pictures uint8 (H, W, 3). depth: T maps float (H, W), planar, 0 where there is no reading. Both
+        may be any sequence, also one that reads files when asked: only frames that become samples are looked at.
+    intrinsics: (3, 3), or (T, 3, 3) of a camera that changes, for pictures of exactly this size.
+    world_from_camera: (4, 4), or (T, 4, 4) of a camera that moves: camera-to-world, z forward.
+    """
+
+    rgb: Sequence[np.ndarray]
+    depth: Sequence[np.ndarray]
+    intrinsics: np.ndarray
+    world_from_camera: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,15 +50,14 @@ class Recording:
 
     task: the name under which demonstrations of one kind are kept together.
     instruction: what was to be done, in words.
-    rgb: T pictures uint8 (H, W, 3). depth: T maps float (H, W), planar, 0 where there is no reading. Both
-        may be any sequence, also one that reads files when asked: only frames that become samples are looked at.
-    intrinsics: (3, 3), or (T, 3, 3) of a camera that changes, for pictures of exactly this size.
-    world_from_camera: (4, 4), or (T, 4, 4) of a camera that moves: camera-to-world, z forward.
+    rgb, depth, intrinsics, world_from_camera: of the camera, or the first one: see `CameraRecording`.
     pose: (T, A, 7), the end-effectors. gripper_open: (T, A), 0 or 1. Of two arms the left one first.
     channels: the order of colours in `rgb`; what OpenCV reads is "bgr".
     keypoints: (A, K, 3), the points that each arm is to go near, in the order of the instruction; an arm with fewer
         than K repeats its last. None where they are not known.
     variation: which of the task's variations it is, None where nobody counts them.
+    camera: the first camera's name, which is kept where there are others. other_cameras: those, by name, in order. All
+        pictures have one size.
     """
 
     task: str
@@ -55,6 +71,14 @@ class Recording:
     keypoints: np.ndarray | None = None
     channels: Literal["rgb", "bgr"] = "rgb"
     variation: int | None = None
+    camera: str = "front"
+    other_cameras: Mapping[str, CameraRecording] = dataclasses.field(default_factory=dict)
+
+    @property
+    def cameras(self) -> dict[str, CameraRecording]:
+        """All cameras by name, in their order."""
+        first = CameraRecording(self.rgb, self.depth, self.intrinsics, self.world_from_camera)
+        return {self.camera: first, **self.other_cameras}
 
 
 def make_demonstration(
@@ -66,7 +90,8 @@ def make_demonstration(
 ) -> Episode:
     """The episode of a recording.
 
-    A camera that stands still must see a keypoint in its first picture; one that moves, as on a wrist, need not.
+    A camera that stands still must see a keypoint in its first picture; one that moves, as on a wrist, need not. Of
+    several that stand still, one must.
 
     Args:
         samples: (observation to look at, observation to go to) each, ascending; see ``keyframes.sample_starts``.
@@ -80,30 +105,37 @@ def make_demonstration(
     if not samples:
         raise DataError(where, "samples", "at least one keyframe to go to", "none", "record until the task is done")
     starts, targets = (np.array(column) for column in zip(*samples, strict=True))
-    count = len(recording.pose)
-    intrinsics, cameras = (
-        _per_observation(recording.intrinsics, count),
-        _per_observation(recording.world_from_camera, count),
-    )
-    rgb = [np.asarray(recording.rgb[start]) for start in starts]
-    depth = [np.asarray(recording.depth[start]) for start in starts]
-    for start, picture, distances in zip(starts, rgb, depth, strict=True):
-        place = f"{where}, observation {start}"
-        check_pictures(picture, distances, place)
-        check_camera(intrinsics[start], cameras[start], picture.shape[:2], place)
+    several = len(recording.cameras) > 1
+    views = {
+        name: _pictures_at(camera, starts, len(recording.pose), where, f", camera {name}" if several else "")
+        for name, camera in recording.cameras.items()
+    }
+    sizes = sorted({one.rgb.shape[:2] for pictures, _ in views.values() for one in pictures})
+    if several and len(sizes) > 1:
+        raise DataError(
+            where, "picture size", "one (height, width) for all cameras", str(sizes), "resize, intrinsics too"
+        )
     keypoints, active = _active_keypoints(recording)
-    if np.abs(cameras - cameras[0]).max() < STANDS_STILL:
-        check_keypoints(keypoints, intrinsics[starts[0]], cameras[starts[0]], rgb[0].shape[:2], where, keypoint_fix)
+    problems = []
+    for pictures, still in views.values():
+        if still:
+            camera, size = pictures[0].camera, pictures[0].rgb.shape[:2]
+            try:
+                check_keypoints(keypoints, camera.intrinsics, camera.world_from_camera, size, where, keypoint_fix)
+            except DataError as error:
+                problems.append(error)
+    if problems and len(problems) == sum(still for _, still in views.values()):
+        raise problems[0]
     pose = np.array(recording.pose, np.float64)
     pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
     return make_episode(
         task=recording.task,
         instruction=recording.instruction,
         seed=seed,
-        rgb=rgb if recording.channels == "rgb" else [picture[..., ::-1] for picture in rgb],
-        depth=depth,
-        intrinsics=intrinsics[starts],
-        world_from_camera=cameras[starts],
+        pictures=[
+            join_cameras([_as_rgb(one, recording.channels) for one in frame])
+            for frame in zip(*(pictures for pictures, _ in views.values()), strict=True)
+        ],
         pose=pose[starts],
         gripper_open=recording.gripper_open[starts],
         target_pose=pose[targets],
@@ -111,7 +143,27 @@ def make_demonstration(
         keypoints=keypoints,
         active_keypoint=active[starts],
         variation=recording.variation,
+        cameras=tuple(views),
     )
+
+
+def _pictures_at(
+    camera: CameraRecording, starts: np.ndarray, count: int, where: object, which: str
+) -> tuple[list[Picture[np.ndarray]], bool]:
+    """The checked pictures of a camera at some observations, and whether it stands still. which: names it in errors."""
+    intrinsics, poses = (_per_observation(x, count) for x in (camera.intrinsics, camera.world_from_camera))
+    pictures = []
+    for start in starts:
+        rgb, depth = np.asarray(camera.rgb[start]), np.asarray(camera.depth[start])
+        place = f"{where}, observation {start}{which}"
+        check_pictures(rgb, depth, place)
+        check_camera(intrinsics[start], poses[start], rgb.shape[:2], place)
+        pictures.append(Picture(rgb, depth, Camera(intrinsics[start], poses[start])))
+    return pictures, bool(np.abs(poses - poses[0]).max() < STANDS_STILL)
+
+
+def _as_rgb(picture: Picture[np.ndarray], channels: Literal["rgb", "bgr"]) -> Picture[np.ndarray]:
+    return picture if channels == "rgb" else dataclasses.replace(picture, rgb=picture.rgb[..., ::-1])
 
 
 def check_recording(recording: Recording, where: object) -> None:
@@ -135,18 +187,12 @@ def check_recording(recording: Recording, where: object) -> None:
     count, arms = pose.shape[:2]
     if gripper.shape != (count, arms):
         raise DataError(where, "gripper_open", f"{(count, arms)} as of pose", str(gripper.shape), "give one an arm")
-    for field in ("rgb", "depth"):
-        if len(getattr(recording, field)) != count:
-            got = f"{len(getattr(recording, field))}"
-            raise DataError(where, field, f"{count} pictures, one a pose", got, "record all streams in step")
-    for field, value, shape in (
-        ("intrinsics", recording.intrinsics, 3),
-        ("world_from_camera", recording.world_from_camera, 4),
-    ):
-        if value is None or np.shape(value) not in ((shape, shape), (count, shape, shape)):
-            got = "nothing" if value is None else str(np.shape(value))
-            expected = f"({shape}, {shape}) or ({count}, {shape}, {shape})"
-            raise DataError(where, field, expected, got, "give the camera's calibration; 3D input cannot do without")
+    if recording.camera in recording.other_cameras or not all(recording.cameras):
+        fix = "give each camera a name of its own"
+        got = ", ".join(map(repr, [recording.camera, *recording.other_cameras]))
+        raise DataError(where, "cameras", "different names", got, fix)
+    for name, camera in recording.cameras.items():
+        _check_camera_recording(camera, count, where if name == recording.camera else f"{where}, camera {name}")
     check_poses(pose, where)
     if wrong := sorted(set(gripper.ravel().tolist()) - {0.0, 1.0}):
         fix = "say when a width counts as open: (width > 0.5 * largest).astype(float)"
@@ -155,6 +201,21 @@ def check_recording(recording: Recording, where: object) -> None:
         shape = np.shape(recording.keypoints)
         if len(shape) != 3 or shape[0] != arms or shape[1] == 0 or shape[2] != 3:
             raise DataError(where, "keypoints", f"({arms}, K, 3) with K >= 1", str(shape), "or None where not known")
+
+
+def _check_camera_recording(camera: CameraRecording, count: int, where: object) -> None:
+    for field in ("rgb", "depth"):
+        if len(getattr(camera, field)) != count:
+            got = f"{len(getattr(camera, field))}"
+            raise DataError(where, field, f"{count} pictures, one a pose", got, "record all streams in step")
+    for field, value, shape in (
+        ("intrinsics", camera.intrinsics, 3),
+        ("world_from_camera", camera.world_from_camera, 4),
+    ):
+        if value is None or np.shape(value) not in ((shape, shape), (count, shape, shape)):
+            got = "nothing" if value is None else str(np.shape(value))
+            expected = f"({shape}, {shape}) or ({count}, {shape}, {shape})"
+            raise DataError(where, field, expected, got, "give the camera's calibration; 3D input cannot do without")
 
 
 def _per_observation(matrix: np.ndarray, count: int) -> np.ndarray:

@@ -1,10 +1,10 @@
 """One demonstration episode as a record of bytes, and one frame of it as a training sample.
 
 A record is a msgpack map of text, integers, arrays (``{"dtype", "shape", "data"}``, little-endian) and, for every
-recorded frame, an RGB picture as PNG and its depth as a 16-bit PNG in units of 0.1 mm (0 = missing reading). Nothing
-is ever unpickled.
+recorded frame and camera, an RGB picture as PNG and its depth as a 16-bit PNG in units of 0.1 mm (0 = missing reading).
+Nothing is ever unpickled. A record of a single camera has no camera axis, and no names of cameras.
 
-Axes: F recorded frames of an episode, and A, H, W, K of ``dsvla_jax.types``. World frame, metres, xyzw quaternions.
+Axes: F recorded frames of an episode, and A, C, H, W, K of ``dsvla_jax.types``. World frame, metres, xyzw quaternions.
 """
 
 import dataclasses
@@ -26,21 +26,24 @@ RECORD_VERSION = 1
 DEPTH_UNIT = 1e-4
 
 _DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1", "|b1")
-_PICTURES = ("rgb_png", "depth_png")
+_LISTS = ("rgb_png", "depth_png", "cameras")
+_CALIBRATION = ("intrinsics", "world_from_camera")
 
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
     """One demonstration: what was seen before each key action, and the key action that the demonstrator took next.
 
-    rgb_png, depth_png: F encoded pictures each (see ``encode_rgb`` and ``encode_depth``).
-    intrinsics: float32 (F, 3, 3). world_from_camera: float32 (F, 4, 4).
+    rgb_png, depth_png: F x C encoded pictures each (see ``encode_rgb`` and ``encode_depth``): all cameras of the first
+        frame, then all of the next.
+    intrinsics: float32 (F, C, 3, 3). world_from_camera: float32 (F, C, 4, 4).
     pose: float32 (F, A, 7). gripper_open: float32 (F, A). The state in which the frame was recorded.
     target_pose: float32 (F, A, 7). target_gripper: float32 (F, A). The next keyframe.
     keypoints: float32 (A, K, 3), in the order of the instruction. active_keypoint: float32 (F, A, 3). Where no keypoint
         is known, K is 0 and active_keypoint (F, 0, 3): such a demonstration is prompted without the constraint.
     seed: the number of the episode in its seed stream. variation: which of the task's variations it is, None where
         nobody counts them.
+    cameras: the C names; empty for one camera, whose name an episode does not keep.
     """
 
     task: str
@@ -57,13 +60,21 @@ class Episode:
     keypoints: np.ndarray
     active_keypoint: np.ndarray
     variation: int | None = None
+    cameras: tuple[str, ...] = ()
+
+    @property
+    def num_cameras(self) -> int:
+        """C."""
+        return max(len(self.cameras), 1)
 
     @property
     def num_frames(self) -> int:
-        return len(self.rgb_png)
+        """F."""
+        return len(self.rgb_png) // self.num_cameras
 
     @property
     def num_arms(self) -> int:
+        """A."""
         return self.pose.shape[1]
 
 
@@ -71,7 +82,8 @@ class Episode:
 class Frame:
     """One recorded moment of an episode, and the keyframe that follows."""
 
-    picture: Picture[np.ndarray]
+    pictures: Picture[np.ndarray]
+    """One of each camera: rgb (C, H, W, 3), and so on."""
     robot: RobotState[np.ndarray]
     keypoint: Float[np.ndarray, "k 3"]
     """The active one of each arm, metres, world frame; none (K = 0) if none is known."""
@@ -154,10 +166,7 @@ def make_episode(
     task: str,
     instruction: str,
     seed: int,
-    rgb: Sequence[np.ndarray] | np.ndarray,
-    depth: Sequence[np.ndarray] | np.ndarray,
-    intrinsics: ArrayLike,
-    world_from_camera: ArrayLike,
+    pictures: Sequence[Picture[np.ndarray]],
     pose: ArrayLike,
     gripper_open: ArrayLike,
     target_pose: ArrayLike,
@@ -165,21 +174,20 @@ def make_episode(
     keypoints: ArrayLike,
     active_keypoint: ArrayLike,
     variation: int | None = None,
+    cameras: Sequence[str] = (),
 ) -> Episode:
-    """Encodes the pictures, rgb uint8 F x (H, W, 3) and depth F x (H, W); a camera without the F axis is repeated."""
-    frames = len(rgb)
+    """Encodes the pictures of F frames, each rgb uint8 (C, H, W, 3), depth float (C, H, W) and the C cameras.
 
-    def per_frame(matrix: ArrayLike, size: int) -> np.ndarray:
-        return np.array(np.broadcast_to(np.asarray(matrix, np.float32), (frames, size, size)))
-
+    cameras: the C names; one camera needs none, and its name is not kept.
+    """
     episode = Episode(
         task=task,
         instruction=instruction,
         seed=int(seed),
-        rgb_png=tuple(encode_rgb(np.asarray(x)) for x in rgb),
-        depth_png=tuple(encode_depth(np.asarray(x)) for x in depth),
-        intrinsics=per_frame(intrinsics, 3),
-        world_from_camera=per_frame(world_from_camera, 4),
+        rgb_png=tuple(encode_rgb(np.asarray(x)) for frame in pictures for x in frame.rgb),
+        depth_png=tuple(encode_depth(np.asarray(x)) for frame in pictures for x in frame.depth),
+        intrinsics=np.array([frame.camera.intrinsics for frame in pictures], np.float32),
+        world_from_camera=np.array([frame.camera.world_from_camera for frame in pictures], np.float32),
         pose=np.asarray(pose, np.float32),
         gripper_open=np.asarray(gripper_open, np.float32),
         target_pose=np.asarray(target_pose, np.float32),
@@ -187,6 +195,7 @@ def make_episode(
         keypoints=np.asarray(keypoints, np.float32),
         active_keypoint=np.asarray(active_keypoint, np.float32),
         variation=variation,
+        cameras=tuple(cameras) if len(cameras) > 1 else (),
     )
     check_episode(episode, f"episode {seed} of {task}")
     return episode
@@ -194,12 +203,12 @@ def make_episode(
 
 def check_episode(episode: Episode, where: object) -> None:
     """Raises DataError unless all shapes agree and every number is finite."""
-    frames = episode.num_frames
+    frames, cameras = episode.num_frames, episode.num_cameras
     arms = episode.pose.shape[1] if episode.pose.ndim == 3 else 1
     keypoints = episode.keypoints.shape[1] if episode.keypoints.ndim == 3 else 1
     expected = {
-        "intrinsics": (frames, 3, 3),
-        "world_from_camera": (frames, 4, 4),
+        "intrinsics": (frames, cameras, 3, 3),
+        "world_from_camera": (frames, cameras, 4, 4),
         "pose": (frames, arms, 7),
         "gripper_open": (frames, arms),
         "target_pose": (frames, arms, 7),
@@ -208,14 +217,32 @@ def check_episode(episode: Episode, where: object) -> None:
         "active_keypoint": (frames, arms if keypoints else 0, 3),
     }
     fix = "generate the data again, or correct the importer that wrote it"
-    if frames == 0 or len(episode.depth_png) != frames:
-        raise DataError(where, "depth_png", f"{max(frames, 1)} pictures", str(len(episode.depth_png)), fix)
+    if len(set(episode.cameras)) < len(episode.cameras) or len(episode.cameras) == 1:
+        raise DataError(where, "cameras", "no name, or several different ones", str(episode.cameras), fix)
+    for field in ("rgb_png", "depth_png"):
+        if frames == 0 or len(getattr(episode, field)) != frames * cameras:
+            expected_count = f"{max(frames, 1) * cameras} pictures"
+            raise DataError(where, field, expected_count, str(len(getattr(episode, field))), fix)
     for field, shape in expected.items():
         value = getattr(episode, field)
         if value.shape != shape or value.dtype != np.float32:
             raise DataError(where, field, f"float32 {shape}", f"{value.dtype} {value.shape}", fix)
         if not np.all(np.isfinite(value)):
             raise DataError(where, field, "finite numbers", f"{int(np.sum(~np.isfinite(value)))} non-finite", fix)
+
+
+def select_cameras(episode: Episode, numbers: Sequence[int]) -> Episode:
+    """The episode as seen by some of its cameras, in the order of their numbers."""
+    chosen = [frame * episode.num_cameras + number for frame in range(episode.num_frames) for number in numbers]
+    names = tuple(episode.cameras[number] for number in numbers) if episode.cameras else ()
+    return dataclasses.replace(
+        episode,
+        rgb_png=tuple(episode.rgb_png[i] for i in chosen),
+        depth_png=tuple(episode.depth_png[i] for i in chosen),
+        intrinsics=episode.intrinsics[:, list(numbers)],
+        world_from_camera=episode.world_from_camera[:, list(numbers)],
+        cameras=names if len(names) > 1 else (),
+    )
 
 
 def pack_episode(episode: Episode) -> bytes:
@@ -227,9 +254,13 @@ def pack_episode(episode: Episode) -> bytes:
             return {"dtype": little.dtype.str, "shape": list(little.shape), "data": little.tobytes()}
         return list(value) if isinstance(value, tuple) else value
 
-    fields = {field.name: plain(getattr(episode, field.name)) for field in dataclasses.fields(episode)}
+    values = {field.name: getattr(episode, field.name) for field in dataclasses.fields(episode)}
     if episode.variation is None:
-        del fields["variation"]
+        del values["variation"]
+    if not episode.cameras:
+        del values["cameras"]
+        values |= {name: values[name][:, 0] for name in _CALIBRATION}
+    fields = {name: plain(value) for name, value in values.items()}
     return cast(bytes, msgpack.packb({"version": RECORD_VERSION, **fields}, use_bin_type=True))
 
 
@@ -246,13 +277,15 @@ def unpack_episode(record: bytes, where: object = "episode record") -> Episode:
     values: dict[str, Any] = {}
     for field in dataclasses.fields(Episode):
         if field.name not in fields:
-            if field.default is None:
+            if field.default is not dataclasses.MISSING:
                 continue
             raise DataError(where, field.name, "to be present", "nothing", fix)
         value = fields[field.name]
         if field.type is np.ndarray:
             value = _unpack_array(value, where, field.name)
-        values[field.name] = tuple(value) if field.name in _PICTURES else value
+        values[field.name] = tuple(value) if field.name in _LISTS else value
+    if "cameras" not in values:
+        values |= {name: values[name][:, None] for name in _CALIBRATION}
     episode = Episode(**values)
     check_episode(episode, where)
     return episode
@@ -269,10 +302,11 @@ def _unpack_array(value: Any, where: object, field: str) -> np.ndarray:
 
 def decode_frame(episode: Episode, place: int, task_index: int = 0, episode_number: int = 0) -> Frame:
     """One frame of an episode as a sample, with writable arrays."""
+    mine = slice(place * episode.num_cameras, (place + 1) * episode.num_cameras)
     return Frame(
-        picture=Picture(
-            decode_rgb(episode.rgb_png[place]),
-            decode_depth(episode.depth_png[place]),
+        pictures=Picture(
+            np.stack([decode_rgb(png) for png in episode.rgb_png[mine]]),
+            np.stack([decode_depth(png) for png in episode.depth_png[mine]]),
             Camera(episode.intrinsics[place].copy(), episode.world_from_camera[place].copy()),
         ),
         robot=RobotState(episode.pose[place].copy(), episode.gripper_open[place].copy()),

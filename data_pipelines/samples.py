@@ -63,7 +63,7 @@ def make_sampler(
         text, answer_mask = encode_text(tokenizer, prompt, answer, encoding.max_text_length)
         rows = np.zeros(len(text.tokens), np.int32)
         rows[answer_mask] = numbers.rows(bins)
-        return Example(frame.picture, text, answer_mask, rows)
+        return Example(frame.pictures, text, answer_mask, rows)
 
     return sample
 

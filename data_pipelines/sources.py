@@ -6,12 +6,14 @@ from typing import Any
 
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
+from data_pipelines.records import picture_size
 from data_pipelines.samples import require_texts_fit
 from dsvla_jax.data_config import DataConfig, OxeConfig
 from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.pose_inputs import encode_instruction
 from dsvla_jax.encoding.text import Tokenizer, check_words, unknown_words
 from dsvla_jax.errors import UserError
+from dsvla_jax.sim.cameras import check_cameras
 from dsvla_jax.sim.tasks import TASKS, select_tasks
 
 
@@ -31,7 +33,7 @@ def open_demonstrations(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader
     folder, tasks, workers = Path(data.folder), choose_tasks(data), os.cpu_count() or 1
     if data.source == "simulator":
         generate_demonstrations(folder, tasks, data.episodes, workers=workers, **_simulator_settings(data))
-        return EpisodeReader(folder, tasks=tasks, episodes=data.episodes)
+        return EpisodeReader(folder, tasks=tasks, episodes=data.episodes, cameras=data.cameras)
     reader = _open_folder(data, tokenizer)
     if (present := len(EpisodeReader(folder, tasks=tasks))) > len(reader):
         print(f"{folder}: {len(reader)} of {present} demonstrations are used (data.episodes is {data.episodes} a task)")
@@ -40,7 +42,8 @@ def open_demonstrations(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader
 
 def _open_folder(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader:
     folder = Path(data.folder)
-    reader = EpisodeReader(folder, tasks=choose_tasks(data), episodes=data.episodes, fewer=True)
+    tasks = choose_tasks(data)
+    reader = EpisodeReader(folder, tasks=tasks, episodes=data.episodes, fewer=True, cameras=data.cameras)
     check_words(folder, reader.instructions, tokenizer, f"python -m data_pipelines.vocabulary {folder} OUT")
     return reader
 
@@ -57,14 +60,14 @@ def open_held_out(data: DataConfig, tokenizer: Tokenizer, episodes: int) -> Epis
         folder, workers = Path(f"{data.folder}_validation"), os.cpu_count() or 1
         settings = _simulator_settings(data)
         generate_demonstrations(folder, tasks, episodes, workers=workers, split="validation", **settings)
-        return EpisodeReader(folder, tasks=tasks, episodes=episodes)
+        return EpisodeReader(folder, tasks=tasks, episodes=episodes, cameras=data.cameras)
     folder = Path(data.folder)
     if used := [task for task in tasks if len(EpisodeReader(folder, tasks=(task,))) <= data.episodes]:
         raise UserError(
             f"{folder}: training uses all demonstrations of {', '.join(used)}, so none are left to validate with; use "
             "fewer of each task (--data.episodes), or turn validation off (--validate-every 0)"
         )
-    reader = EpisodeReader(folder, tasks=tasks, episodes=episodes, skip=data.episodes, fewer=True)
+    reader = EpisodeReader(folder, tasks=tasks, episodes=episodes, skip=data.episodes, fewer=True, cameras=data.cameras)
     check_words(folder, reader.instructions, tokenizer, f"python -m data_pipelines.vocabulary {folder} OUT")
     return reader
 
@@ -84,6 +87,8 @@ def require_data_fits(
     if data.source == "simulator":
         picture, name = (data.image_size, data.image_size), "data.image_size"
         tasks = [TASKS[task] for task in choose_tasks(data)]
+        for task in tasks:
+            check_cameras(data.cameras, task.num_arms)
         texts = [(text, task.num_arms) for task in tasks for text in task.all_instructions()]
         if unknown := unknown_words([text for text, _ in texts], tokenizer):
             raise UserError(
@@ -94,10 +99,9 @@ def require_data_fits(
         reader, name = _open_folder(data, tokenizer), data.folder
         if held_out:
             open_held_out(data, tokenizer, held_out)
-        height, width = reader.frame(0).picture.depth.shape
-        picture = (height, width)
+        picture = picture_size(reader.episode(0).rgb_png[0])
         texts = [(text, min(reader.num_arms.values())) for text in reader.instructions]
-    encoding.require_points(*picture, f"a picture of {name}")
+    encoding.require_points(*picture, len(data.cameras), f"a picture of {name}")
     if instructions_only:
         for text, _ in texts:
             encode_instruction(tokenizer, text, encoding.max_text_length)
@@ -109,11 +113,11 @@ def require_data_fits(
 def require_oxe_fits(oxe: OxeConfig, encoding: EncodingConfig, tokenizer: Tokenizer) -> tuple[int, int]:
     """As `require_data_fits`, of Open X-Embodiment: with the shortest text, since instructions are not read yet."""
     picture = (oxe.image_size, oxe.image_size)
-    encoding.require_points(*picture, "a picture of oxe.image_size")
+    encoding.require_points(*picture, 1, "a picture of oxe.image_size")
     require_texts_fit(encoding, tokenizer, [("", 1)])
     return picture
 
 
 def _simulator_settings(data: DataConfig) -> dict[str, Any]:
-    names = ("image_size", "seed", "perturb", "keypoints")
+    names = ("image_size", "cameras", "seed", "perturb", "keypoints")
     return {name: getattr(data, name) for name in names}

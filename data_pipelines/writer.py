@@ -25,6 +25,7 @@ from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.files import hold_folder
 from dsvla_jax.observation_checks import check_surface
 from dsvla_jax.ranges import at_least, require
+from dsvla_jax.types import split_cameras
 
 EPISODES_PER_SHARD = 20
 
@@ -71,6 +72,7 @@ class DemonstrationWriter:
             raise
         self._report_strays()
         self._sizes = {entry["task"]: tuple(entry["picture_size"]) for entry in self._entries}
+        self._cameras = {tuple(entry.get("cameras", ())) for entry in self._entries}
         self._counts = {entry["task"]: 0 for entry in self._entries}
         for entry in self._entries:
             self._counts[entry["task"]] += len(entry["frames"])
@@ -121,9 +123,11 @@ class DemonstrationWriter:
             raise DataError(where, "keyframes", f"ascending numbers from 1 to {count - 1}", str(numbers)[:80], fix)
         episode = make_demonstration(recording, sample_starts(numbers, self.every_n), number, where)
         self._check_box(episode, where)
-        first = decode_frame(episode, 0).picture
-        camera = first.camera
-        check_surface(first.depth, camera.intrinsics, camera.world_from_camera, episode.keypoints, where)
+        first = split_cameras(decode_frame(episode, 0).pictures)
+        for name, one in zip(episode.cameras or ("",), first, strict=True):
+            place, camera = f"{where}, camera {name}" if name else where, one.camera
+            check_surface(one.depth, camera.intrinsics, camera.world_from_camera, episode.keypoints, place)
+        self._check_cameras(episode, where)
         self._check_size(episode, where)
         self._counts[recording.task] = number + 1
         self._waiting.setdefault(recording.task, []).append(episode)
@@ -154,6 +158,14 @@ class DemonstrationWriter:
             got = positions[outside.any(axis=1)][0].tolist()
             fix = "move the world's origin (poses, cameras and keypoints alike), or give the config's own codec"
             raise DataError(where, "pose", f"positions from {low.tolist()} to {high.tolist()}", f"{got}", fix)
+
+    def _check_cameras(self, episode: Episode, where: str) -> None:
+        if self._cameras - {episode.cameras}:
+            (known,) = self._cameras
+            fix = "record with the same cameras, or write a folder for each set of them"
+            expected, got = (", ".join(names) or "one camera" for names in (known, episode.cameras))
+            raise DataError(where, "cameras", f"{expected}, as in {self.folder}", got, fix)
+        self._cameras = {episode.cameras}
 
     def _check_size(self, episode: Episode, where: str) -> None:
         sizes = sorted({picture_size(png) for png in episode.rgb_png})

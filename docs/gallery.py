@@ -63,7 +63,7 @@ def draw(name: str) -> Path:
             f"task {name!r}: its expert failed on all {CANDIDATES} episodes; see benchmarks.expert_success."
         )
     best = int(np.argmax(succeeded))
-    frames = [np.asarray(environment.observe(state).picture.rgb[best]) for state in (states[0], states[-1])]
+    frames = [np.asarray(environment.render(state).rgb[best]) for state in (states[0], states[-1])]
     path = DOCS / "images" / "tasks" / f"{name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_picture(path, film_strip(frames), compression=9)

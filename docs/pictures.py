@@ -19,7 +19,7 @@ def demonstration(name: str) -> np.ndarray:
     environment = Environment(name, image_size=SIZE)
     state = environment.reset(episode_keys(1, "validation", name, 0, 1))
     plan = environment.expert(state)
-    frames = [np.asarray(environment.observe(s).picture.rgb[0]) for s in environment.follow(state, plan)]
+    frames = [np.asarray(environment.render(s).rgb[0]) for s in environment.follow(state, plan)]
     targets = np.asarray(plan.pose[0, :, :, :3])
     frames[:-1] = [mark_targets(f, t, environment.camera) for f, t in zip(frames[:-1], targets, strict=True)]
     frames += [np.full_like(frames[0], 255)] * (COLUMNS - len(frames))

@@ -1,26 +1,32 @@
 """Configs as JSON files: frozen dataclasses in and out."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cattrs
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.json_values import Json
 
 Config = TypeVar("Config")
 
 _converter = cattrs.Converter(forbid_extra_keys=True)
 
 
-def read_config(file: Path, cls: type[Config], what: str) -> Config:
+def read_config(
+    file: Path, cls: type[Config], what: str, mend: Callable[[dict[str, Json]], None] | None = None
+) -> Config:
     """The config that a JSON file holds. Raises UserError naming the file and what is wrong in it.
 
-    what: what the file should be, for the message.
+    what: what the file should be, for the message. mend: turns a map that an earlier version wrote into this version's.
     """
     try:
-        return _converter.structure(json.loads(file.read_text()), cls)
+        fields = json.loads(file.read_text())
+        if mend is not None and isinstance(fields, dict):
+            mend(fields)
+        return _converter.structure(fields, cls)
     except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
         raise UserError(f"{file}: not {what} of this version: {'; '.join(_problems(error))}") from error
 

@@ -9,6 +9,8 @@ SHARE = at_least(0, at_most=1)
 # Noise in metres: the box that poses are counted in is 2 m wide.
 NOISE = at_least(0, at_most=10)
 
+MAX_CAMERAS = 4
+
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig:
@@ -22,6 +24,10 @@ class DataConfig:
     """Names of tasks, all, single_arm or dual_arm; of imported or own demonstrations names or all."""
     episodes: int = 100
     """Demonstrations a task; of imported or own ones, at most so many."""
+    cameras: tuple[str, ...] = ("front",)
+    """Names of 1 to 4 cameras to learn from, in this order. The simulator's are front, left_shoulder, right_shoulder,
+    overhead and wrist, of two arms wrist_left and wrist_right. `front` is also the only camera of demonstrations that
+    have no other, whatever its name."""
     image_size: int = 96
     """Rendered pixels a side."""
     seed: int = 0
@@ -60,6 +66,9 @@ class DataConfig:
             colour_variation=SHARE,
         )
         require_folder("data.folder", self.folder)
+        distinct = len(set(self.cameras)) == len(self.cameras) and all(self.cameras)
+        expected = f"1 to {MAX_CAMERAS} different names"
+        require(distinct and 1 <= len(self.cameras) <= MAX_CAMERAS, "data.cameras", expected, self.cameras)
         require(bool(_names(self.tasks)), "data.tasks", "names of tasks", self.tasks)
 
 
@@ -131,8 +140,8 @@ class LearnedFrom:
     arms: tuple[int, ...]
     """The numbers of arms."""
     tasks: tuple[str, ...] = ()
-    camera: str = ""
-    """The camera's name; empty if the data do not say."""
+    cameras: tuple[str, ...] = ()
+    """The cameras' names, in their order; empty for one camera of which the data do not say the name."""
 
 
 def require_folder(option: str, folder: str) -> None:

@@ -197,6 +197,7 @@ class Experiment:
             require(bool(self.oxe.mixture), "oxe.mixture", "a named mixture or names of datasets", self.oxe.mixture)
         if uses_model(self.baseline):
             require_same_sizes(self.encoding, self.model)
+            self._require_as_many_cameras()
         else:
             self._require_no_model()
         adapters = self.regime == "full" or self.model.lora is not None
@@ -207,6 +208,22 @@ class Experiment:
             "'same' with regime 'full', which trains all weights",
             repr(self.model.base_dtype),
             "use regime 'lora' for frozen weights",
+        )
+
+    @property
+    def num_cameras(self) -> int:
+        """C, of what is learned from."""
+        return len(self.data.cameras) if self.oxe is None else 1
+
+    def _require_as_many_cameras(self) -> None:
+        """Raises UserError if the model was made for more or fewer cameras than the data have."""
+        names = self.data.cameras if self.oxe is None else ("the only one",)
+        require(
+            self.model.cameras == len(names),
+            "model.cameras",
+            f"{len(names)}, as many as there are to learn from ({', '.join(names)})",
+            self.model.cameras,
+            f"use --model.cameras {len(names)}" + (", or other --data.cameras" if self.oxe is None else ""),
         )
 
     def _require_no_model(self) -> None:

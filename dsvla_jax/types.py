@@ -4,6 +4,7 @@ An array dimension has one letter everywhere:
 
     b  batch of examples or of parallel episodes      t  text tokens
     a  arms (1 or 2; the left arm first)              v  vocabulary
+    c  cameras (1 to 4), in the order of their names
     h, w  image height and width, pixels              d  feature channels
     p  points of a cloud                              g  3D tokens (groups); also FPS centres
     n  2D image patches                               k  neighbours, or keypoints where no cloud is near
@@ -20,7 +21,7 @@ the world frame. Quaternions are xyzw, unit length, canonical (qw >= 0). `grippe
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Generic, TypeVar, dataclass_transform
 
 import jax
@@ -64,7 +65,7 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def named_arrays(tree: object) -> dict[str, Array | np.ndarray]:
-    """Returns the arrays of a struct by their paths, such as `picture.camera.intrinsics`."""
+    """Returns the arrays of a struct by their paths, such as `pictures.camera.intrinsics`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
@@ -82,13 +83,23 @@ class Camera(Generic[ArrayT]):
 
 @pytree
 class Picture(Generic[ArrayT]):
-    """One RGB-D picture and the camera that took it."""
+    """One RGB-D picture and the camera that took it, or a stack of them."""
 
     rgb: UInt8[ArrayT, "*b h w 3"]
     depth: Float[ArrayT, "*b dh dw"]
     """float32, planar Z in metres; 0 or a non-finite value marks a missing reading. As large as `rgb`, or one missing
     pixel (1, 1) for data without depth."""
     camera: Camera[ArrayT]
+
+
+def split_cameras(pictures: Picture[np.ndarray]) -> list[Picture[np.ndarray]]:
+    """Returns the pictures of one moment, stacked on a camera axis in front, one by one."""
+    return [jax.tree.map(lambda x, c=c: x[c], pictures) for c in range(len(pictures.rgb))]
+
+
+def join_cameras(pictures: Sequence[Picture[np.ndarray]]) -> Picture[np.ndarray]:
+    """The inverse of `split_cameras`."""
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *pictures)
 
 
 @pytree
@@ -101,9 +112,10 @@ class RobotState(Generic[ArrayT]):
 
 @pytree
 class Observation(Generic[ArrayT]):
-    """What a policy may look at: a picture and the robot's state."""
+    """What a policy may look at: pictures and the robot's state."""
 
-    picture: Picture[ArrayT]
+    pictures: Picture[ArrayT]
+    """One of each camera: rgb (*b, c, h, w, 3), and so on. All have one size."""
     robot: RobotState[ArrayT]
 
 
@@ -128,9 +140,10 @@ class Text(Generic[ArrayT]):
 
 @pytree
 class Example(Generic[ArrayT]):
-    """What a policy learns from: a picture, and prompt and answer as text."""
+    """What a policy learns from: pictures, and prompt and answer as text."""
 
-    picture: Picture[ArrayT]
+    pictures: Picture[ArrayT]
+    """One of each camera, as of an `Observation`."""
     text: Text[ArrayT]
     answer_mask: Bool[ArrayT, "*b t"]
     """True on the tokens to learn: the answer's, and its end."""
@@ -154,7 +167,8 @@ class HeldOutExample(Generic[ArrayT]):
 class PoseInputs(Generic[ArrayT]):
     """What a policy reads that answers with poses: all robots have two arms here, of which one may be missing."""
 
-    picture: Picture[ArrayT]
+    pictures: Picture[ArrayT]
+    """One of each camera, as of an `Observation`."""
     robot: RobotState[ArrayT]
     """Of two arms; a missing one's is zeros."""
     arms: Bool[ArrayT, "*b 2"]
@@ -181,10 +195,11 @@ class PoseExample(Generic[ArrayT]):
 class ModelInputs(Generic[ArrayT]):
     """What the network reads. `encoding.encode.model_inputs` makes it."""
 
-    image: Float[ArrayT, "*b s s 3"]
-    """float32, normalised as CLIP's."""
+    images: Float[ArrayT, "*b c s s 3"]
+    """float32, one of each camera, normalised as CLIP's."""
     point_tokens: Float[ArrayT, "*b g d"]
     """float32, from the 3D tokenizer; G = 0 for a policy without 3D input."""
     point_patches: Int[ArrayT, "*b g"]
-    """int32: the image patch (row-major) whose positional embedding a 3D token carries."""
+    """int32: camera * N + patch: the image patch (row-major) that a 3D token is aligned with, and whose positional
+    embedding it carries."""
     text: Text[ArrayT]

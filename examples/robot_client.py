@@ -24,14 +24,14 @@ from dsvla_jax.serving.client import PolicyClient
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import get_task, select_tasks
-from dsvla_jax.types import Action
+from dsvla_jax.types import Action, split_cameras
 
 
 class Robot(Protocol):
     """What the loop asks of a robot; docs/serving.md has the fields of an observation."""
 
     def observe(self) -> dict[str, Any]:
-        """The picture with its camera, the arms' poses and grippers, and keypoints if they are known."""
+        """The pictures with their cameras, the arms' poses and grippers, and keypoints if they are known."""
         ...
 
     def move(self, pose: np.ndarray, gripper_open: np.ndarray) -> None:
@@ -46,14 +46,20 @@ class Robot(Protocol):
 class SimulatedRobot:
     """One episode of a task in C MuJoCo, from a start that no demonstration has.
 
+    cameras: names of the simulator's cameras, see `dsvla_jax.sim.cameras`.
     keypoints: those that the policy learned with: found in the first picture with the simulator's masks
         (segmentation), the task's own (oracle), or none.
     """
 
     def __init__(
-        self, task: str, image_size: int, seed: int, keypoints: Literal["segmentation", "oracle", "none"]
+        self,
+        task: str,
+        image_size: int,
+        seed: int,
+        keypoints: Literal["segmentation", "oracle", "none"],
+        cameras: tuple[str, ...] = ("front",),
     ) -> None:
-        self.environment = Environment(task, image_size=image_size)
+        self.environment = Environment(task, image_size=image_size, cameras=cameras)
         self._state = self.environment.reset(episode_keys(0, "eval", task, seed, 1))
         self.prompt = self.environment.instructions(self._state, seed)[0]
         self._kind, self._find = keypoints, None
@@ -65,12 +71,14 @@ class SimulatedRobot:
     def observe(self) -> dict[str, Any]:
         seen = self.environment.observe(self._state)
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[0], seen)
+        # The fields of a single camera have no camera axis.
+        pictures = one.pictures if len(one.pictures.rgb) > 1 else split_cameras(one.pictures)[0]
         observation = {
-            "rgb": one.picture.rgb,
+            "rgb": pictures.rgb,
             # As in the demonstrations, what is farther than a depth camera sees has no reading.
-            "depth": np.where(one.picture.depth <= MAX_DEPTH, one.picture.depth, 0),
-            "intrinsics": one.picture.camera.intrinsics,
-            "world_from_camera": one.picture.camera.world_from_camera,
+            "depth": np.where(pictures.depth <= MAX_DEPTH, pictures.depth, 0),
+            "intrinsics": pictures.camera.intrinsics,
+            "world_from_camera": pictures.camera.world_from_camera,
             "pose": one.robot.pose,
             "gripper_open": one.robot.gripper_open,
         }
@@ -145,7 +153,9 @@ def simulated_robot(metadata: dict[str, Any], task: str, seed: int) -> Simulated
             "--image-size 96x96 besides"
         )
     keypoints = learned.get("keypoints", "oracle" if metadata["needs_keypoints"] else "none")
-    return SimulatedRobot(task, squares[0], seed, "oracle" if keypoints == "recorded" else keypoints)
+    only = learned["camera"] if learned.get("source") == "simulator" and "camera" in learned else "front"
+    cameras = tuple(metadata.get("cameras", [only]))
+    return SimulatedRobot(task, squares[0], seed, "oracle" if keypoints == "recorded" else keypoints, cameras)
 
 
 @dataclasses.dataclass(frozen=True)

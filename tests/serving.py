@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import ModelConfig
@@ -22,16 +23,20 @@ SIZE = 32
 PROMPTS = ("turn on the light", "close the fridge", "lift the ball", "press the red button")
 
 
-def tiny_policy(use_keypoints: bool = True, use_points: bool = True, words: Iterable[str] = PROMPTS) -> TextPolicy:
+def tiny_policy(
+    use_keypoints: bool = True, use_points: bool = True, words: Iterable[str] = PROMPTS, cameras: tuple[str, ...] = ()
+) -> TextPolicy:
     """Random weights, larger than at initialisation, so that different observations get different answers."""
     tokenizer = WordTokenizer(vocabulary(words))
     encoding = small_encoding(max_text_length=48, use_keypoints=use_keypoints, use_points=use_points)
     model = ModelConfig(
         vision=small_vision(),
         language=small_language(tokenizer.vocab_size),
+        cameras=max(len(cameras), 1),
     )
+    learned = LearnedFrom("simulator", "oracle", (SIZE, SIZE), (1,), ("lamp_on",), cameras) if cameras else None
     variables = jax.tree.map(lambda x: 3.0 * x, initialize(model, jax.random.key(0)))
-    return TextPolicy(PolicyConfig(encoding, model), variables, tokenizer)
+    return TextPolicy(PolicyConfig(encoding, model, learned_from=learned), variables, tokenizer)
 
 
 def observation(seed: int, arms: int = 1, size: int = SIZE) -> dict[str, Any]:

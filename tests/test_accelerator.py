@@ -277,8 +277,8 @@ def test_geometry_asks_accelerators_for_whole_float32_products():
     start = Start(
         scene.initial, camera, jnp.ones(3), jnp.asarray(scene.mj_model.geom_size), jnp.asarray(scene.mj_model.geom_pos)
     )
-    batch = jax.tree.map(lambda x: x[None], camera)
-    seen = Picture(jnp.zeros((1, 32, 32, 3), jnp.uint8), jnp.ones((1, 32, 32)), batch)
+    batch = jax.tree.map(lambda x: x[None, None], camera)
+    seen = Picture(jnp.zeros((1, 1, 32, 32, 3), jnp.uint8), jnp.ones((1, 1, 32, 32)), batch)
     found = {
         "shifts": products(lambda key, start: shift(scene, key, start), jax.random.key(0), start),
         "kinematics": products(

@@ -9,7 +9,7 @@ import pytest
 
 from data_pipelines import augment
 from data_pipelines.records import decode_frame
-from dsvla_jax.types import named_arrays
+from dsvla_jax.types import join_cameras, named_arrays, split_cameras
 from tests.random_data import random_episode
 
 
@@ -20,8 +20,8 @@ def arrays_of(frame):
 
 def project(points, frame):
     """Pixels of world points, written out with homogeneous matrices."""
-    camera = np.linalg.inv(frame.picture.camera.world_from_camera.astype(np.float64)) @ np.append(points, 1.0)
-    pixel = frame.picture.camera.intrinsics.astype(np.float64) @ camera[:3]
+    camera = np.linalg.inv(frame.pictures.camera.world_from_camera[0].astype(np.float64)) @ np.append(points, 1.0)
+    pixel = frame.pictures.camera.intrinsics[0].astype(np.float64) @ camera[:3]
     return pixel[:2] / pixel[2]
 
 
@@ -35,7 +35,7 @@ def test_shift_world_keeps_every_pixel():
         np.testing.assert_allclose(project(moved[0, :3], shifted), project(old[0, :3], frame), atol=1e-3)
         np.testing.assert_allclose(moved[0, :3] - old[0, :3], offset, atol=1e-6)
     np.testing.assert_array_equal(shifted.robot.pose[:, 3:], frame.robot.pose[:, 3:])
-    assert shifted.picture.rgb is frame.picture.rgb
+    assert shifted.pictures.rgb is frame.pictures.rgb
 
 
 def smooth_frame(size=64):
@@ -44,42 +44,48 @@ def smooth_frame(size=64):
     v, u = np.mgrid[:size, :size]
     depth = (1 + 0.002 * u + 0.004 * v).astype(np.float32)
     rgb = np.stack([3 * u, 3 * v, np.full_like(u, 90)], -1).astype(np.uint8)
-    return replace(frame, picture=replace(frame.picture, rgb=rgb, depth=depth))
+    return replace(frame, pictures=replace(frame.pictures, rgb=rgb[None], depth=depth[None]))
 
 
 def world_points(frame):
-    v, u = np.mgrid[: frame.picture.depth.shape[0], : frame.picture.depth.shape[1]]
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.picture.camera.intrinsics.astype(np.float64)).T
-    points = rays * frame.picture.depth[..., None]
-    return points @ frame.picture.camera.world_from_camera[:3, :3].T + frame.picture.camera.world_from_camera[:3, 3]
+    v, u = np.mgrid[: frame.pictures.depth.shape[1], : frame.pictures.depth.shape[2]]
+    rays = (
+        np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(frame.pictures.camera.intrinsics[0].astype(np.float64)).T
+    )
+    points = rays * frame.pictures.depth[0, ..., None]
+    return (
+        points @ frame.pictures.camera.world_from_camera[0][:3, :3].T
+        + frame.pictures.camera.world_from_camera[0][:3, 3]
+    )
 
 
 def test_a_crop_keeps_every_point_at_its_place():
     frame = smooth_frame()
     for seed in range(20):
         cropped = augment.random_crop(frame, np.random.default_rng(seed), 0.4)
-        assert cropped.picture.depth.shape == (64, 64)
-        for name in ("picture.camera.world_from_camera", "robot.pose", "target.pose", "keypoint"):
+        assert cropped.pictures.depth.shape == (1, 64, 64)
+        for name in ("pictures.camera.world_from_camera", "robot.pose", "target.pose", "keypoint"):
             np.testing.assert_array_equal(arrays_of(cropped)[name], arrays_of(frame)[name])
         # Where the original camera sees each point of the cropped cloud, its picture has the same colour and depth.
         for v in range(0, 64, 7):
             for u in range(0, 64, 7):
                 x, y = project(world_points(cropped)[v, u], frame)
-                np.testing.assert_allclose(cropped.picture.rgb[v, u, :2], [3 * x, 3 * y], atol=1.1)
-                assert abs(cropped.picture.depth[v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
+                np.testing.assert_allclose(cropped.pictures.rgb[0, v, u, :2], [3 * x, 3 * y], atol=1.1)
+                assert abs(cropped.pictures.depth[0, v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
     assert (
-        augment.random_crop(frame, np.random.default_rng(0), 1.0).picture.camera.intrinsics.tolist()
-        == frame.picture.camera.intrinsics.tolist()
+        augment.random_crop(frame, np.random.default_rng(0), 1.0).pictures.camera.intrinsics.tolist()
+        == frame.pictures.camera.intrinsics.tolist()
     )
 
 
 def test_a_window_of_the_picture_is_that_window():
     frame = smooth_frame(65)
-    cropped = augment.crop(frame, 10, 20, 33, 33)
-    np.testing.assert_array_equal(cropped.picture.rgb[::2, ::2], frame.picture.rgb[10:43, 20:53])
+    (whole,) = split_cameras(frame.pictures)
+    cropped = replace(frame, pictures=join_cameras([augment.crop(whole, 10, 20, 33, 33)]))
+    np.testing.assert_array_equal(cropped.pictures.rgb[0, ::2, ::2], whole.rgb[10:43, 20:53])
     np.testing.assert_allclose(world_points(cropped)[::2, ::2], world_points(frame)[10:43, 20:53], atol=1e-5)
     with pytest.raises(ValueError, match="crop: expected a window within 65 x 65"):
-        augment.crop(frame, 40, 0, 32, 32)
+        augment.crop(whole, 40, 0, 32, 32)
 
 
 def test_offsets_are_whole_centimetres():
@@ -97,7 +103,7 @@ def test_noise_changes_what_it_says_and_nothing_else():
     variations = {
         "robot.pose": lambda rng: augment.jitter_state(frame, rng, 0.02, 1.0),
         "keypoint": lambda rng: augment.perturb_keypoint(frame, rng, 0.03, 1.0),
-        "picture.rgb": lambda rng: augment.vary_colour(frame, rng),
+        "pictures.rgb": lambda rng: augment.vary_colour(frame, rng),
     }
     for changed, vary in variations.items():
         result = arrays_of(vary(np.random.default_rng(1)))
@@ -109,4 +115,4 @@ def test_noise_changes_what_it_says_and_nothing_else():
     moved = variations["keypoint"](np.random.default_rng(2)).keypoint - frame.keypoint
     assert 0 < np.abs(moved).max() <= 0.03 + 1e-6
     assert augment.perturb_keypoint(frame, np.random.default_rng(0), 0.03, 0.0) is frame
-    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0).picture.rgb, frame.picture.rgb)
+    assert np.array_equal(augment.vary_colour(frame, np.random.default_rng(0), 0.0).pictures.rgb, frame.pictures.rgb)

@@ -100,7 +100,7 @@ def run_clip(tower: Tower, size: int):
     model = VisionTower(ModelConfig(vision=tower.config))
     width = tower.config.width
     no_points = jnp.zeros((2, 0, width)), jnp.zeros((2, 0), jnp.int32)
-    return jax.jit(model.apply)({"params": tower.load()}, draw_image(size), *no_points)
+    return jax.jit(model.apply)({"params": tower.load()}, draw_image(size)[:, None], *no_points)
 
 
 @pytest.mark.parametrize("name", [*CLIPS, "clip"])

@@ -36,17 +36,17 @@ ROWS = {
 }
 
 
-def frame(arms: int, rng: np.random.Generator) -> Frame:
+def frame(arms: int, cameras: int, rng: np.random.Generator) -> Frame:
     down = np.array([0, 1, 0, 0], np.float32)
 
     def pose() -> np.ndarray:
         return np.concatenate([rng.uniform([0, -0.3, 0.8], [0.4, 0.3, 1.2], (arms, 3)), [down] * arms], 1)
 
     return Frame(
-        picture=Picture(
-            rng.integers(0, 255, (96, 96, 3), np.uint8),
-            rng.uniform(1.0, 1.3, (96, 96)).astype(np.float32),
-            jax.tree.map(np.asarray, front_camera(96)),
+        pictures=Picture(
+            rng.integers(0, 255, (cameras, 96, 96, 3), np.uint8),
+            rng.uniform(1.0, 1.3, (cameras, 96, 96)).astype(np.float32),
+            jax.tree.map(lambda x: np.stack([np.asarray(x)] * cameras), front_camera(96)),
         ),
         robot=RobotState(pose().astype(np.float32), np.ones(arms, np.float32)),
         keypoint=pose()[:, :3].astype(np.float32),
@@ -72,11 +72,14 @@ def small(name: str) -> Experiment:
 
 def batch_of(experiment: Experiment) -> Example[np.ndarray]:
     sample = make_sampler(experiment.data, experiment.encoding, suite_tokenizer())
-    samples = [sample(frame(1 + i % 2, np.random.default_rng(i)), np.random.default_rng(i)) for i in range(4)]
+    samples = [
+        sample(frame(1 + i % 2, experiment.model.cameras, np.random.default_rng(i)), np.random.default_rng(i))
+        for i in range(4)
+    ]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", [*ROWS, "tiny_two_cameras"])
 def test_row_trains(name: str):
     experiment = small(name)
     batch = batch_of(experiment)
@@ -102,7 +105,7 @@ def test_row_is_what_the_table_says(name: str, row: tuple[bool, bool, bool]):
     near = suite_tokenizer().encode("near")[0]
     assert (batch.text.tokens == near).any(axis=1).all() == constraint
     example = jax.tree.map(jnp.asarray, batch)
-    inputs = model_inputs(example.picture, example.text, experiment.encoding)
+    inputs = model_inputs(example.pictures, example.text, experiment.encoding)
     tokens = inputs.point_tokens.shape[1]
     assert tokens == (experiment.model.vision.num_patches if points else 0)
     in_order = (np.asarray(inputs.point_patches) == np.arange(tokens)).all()

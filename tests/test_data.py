@@ -94,7 +94,9 @@ def test_reader_numbers_all_episodes_and_frames(folder):
     assert len(EpisodeReader(folder, episodes=4)) == 4
     with pytest.raises(DataError, match="episodes of lamp_on: expected at least 8, got 7; run"):
         EpisodeReader(folder, episodes=8)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).frame(2).picture.rgb, reader.frame(2).picture.rgb)
+    np.testing.assert_array_equal(
+        pickle.loads(pickle.dumps(reader)).frame(2).pictures.rgb, reader.frame(2).pictures.rgb
+    )
 
 
 def test_writing_twice_gives_the_same_bytes(folder, tmp_path_factory):
@@ -160,13 +162,13 @@ def test_an_epoch_is_every_frame_once_in_a_new_order(folder):
 
 def test_batches_have_stacked_fields(folder):
     def sample(frame, rng):
-        return frame.picture, frame.robot, frame.target, frame.keypoint, np.array(frame.instruction)
+        return frame.pictures, frame.robot, frame.target, frame.keypoint, np.array(frame.instruction)
 
     batch = next(make_loader(EpisodeReader(folder), sample, batch_size=4, seed=0))
-    picture, robot, target, keypoint = jax.tree.map(lambda value: (value.shape, value.dtype), batch[:4])
-    assert picture.rgb == ((4, 8, 8, 3), np.uint8)
-    assert picture.depth == ((4, 8, 8), np.float32)
-    assert picture.camera.world_from_camera == ((4, 4, 4), np.float32)
+    pictures, robot, target, keypoint = jax.tree.map(lambda value: (value.shape, value.dtype), batch[:4])
+    assert pictures.rgb == ((4, 1, 8, 8, 3), np.uint8)
+    assert pictures.depth == ((4, 1, 8, 8), np.float32)
+    assert pictures.camera.world_from_camera == ((4, 1, 4, 4), np.float32)
     assert robot.pose == target.pose == ((4, 1, 7), np.float32)
     assert keypoint == ((4, 1, 3), np.float32)
     assert [str(text)[:10] for text in batch[4]] == ["do lamp_on"] * 4
@@ -175,7 +177,7 @@ def test_batches_have_stacked_fields(folder):
 def test_resumed_iterator_continues_exactly(folder):
     def sample(frame, rng):
         frame = augment.perturb_keypoint(frame, rng, 0.03, 0.5)
-        return {"rgb": frame.picture.rgb, "keypoint": frame.keypoint, **place(frame, rng)}
+        return {"rgb": frame.pictures.rgb, "keypoint": frame.keypoint, **place(frame, rng)}
 
     iterator = make_loader(EpisodeReader(folder), sample, batch_size=4, seed=1)
     for _ in range(6):
@@ -288,7 +290,7 @@ def test_a_sample_of_equal_shapes_mixes_tasks_of_one_and_two_arms(tmp_path):
     reader = EpisodeReader(tmp_path)
 
     def sample(frame, rng):
-        return {"rgb": frame.picture.rgb, "task": np.array(frame.task_index)}
+        return {"rgb": frame.pictures.rgb, "task": np.array(frame.task_index)}
 
     batch = next(make_loader(reader, sample, batch_size=6, seed=0))
     assert sorted(batch["task"]) == [0, 0, 0, 1, 1, 1]
@@ -425,9 +427,9 @@ def test_recorded_expert_succeeds_again_from_its_seed(tmp_path):
     first = environment.observe(state)
     for i in range(2):
         frame = decode_frame(reader.episode(i), 0)
-        np.testing.assert_array_equal(frame.picture.rgb, first.picture.rgb[i])
+        np.testing.assert_array_equal(frame.pictures.rgb, first.pictures.rgb[i])
         # The format keeps tenths of a millimetre.
-        np.testing.assert_allclose(frame.picture.depth, mark_missing(np.asarray(first.picture.depth[i])), atol=1e-4)
+        np.testing.assert_allclose(frame.pictures.depth, mark_missing(np.asarray(first.pictures.depth[i])), atol=1e-4)
     for m in range(episode.num_frames):
         both = [reader.episode(i) for i in range(2)]
         pose = jnp.stack([x.target_pose[m] for x in both])
@@ -449,10 +451,10 @@ def test_keypoints_of_demonstrations_may_be_those_found_in_the_first_picture():
         start = expert.environment.reset(episode_keys(0, "train", "lamp_on", episode.seed, 1))
         frame, point = decode_frame(episode, 0), episode.keypoints[0, 0]
         camera = Camera(
-            jnp.asarray(frame.picture.camera.intrinsics), jnp.asarray(frame.picture.camera.world_from_camera)
+            jnp.asarray(frame.pictures.camera.intrinsics[0]), jnp.asarray(frame.pictures.camera.world_from_camera[0])
         )
         (u, v), depth = project(jnp.asarray(point), camera)
-        assert abs(frame.picture.depth[round(float(v)), round(float(u))] - depth) < 0.01
+        assert abs(frame.pictures.depth[0, round(float(v)), round(float(u))] - depth) < 0.01
         away = np.linalg.norm(point - np.asarray(expert.environment.keypoints(start))[0, 0, 0])
         assert 1e-4 < away < 0.03
 

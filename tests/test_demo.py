@@ -37,7 +37,7 @@ def test_tokens_are_drawn_where_they_are_and_joined_to_their_patch():
     request = parse_request(observation(0), Expected(((SIZE, SIZE),), (1,), tiny_policy().config.encoding))
     black = np.zeros((SIZE, SIZE, 3), np.uint8)
     # On the camera's axis, hence at the middle of the picture; its patch is the first of 2 x 2.
-    camera = jax.tree.map(np.asarray, request.observation.picture.camera)
+    camera = jax.tree.map(lambda x: np.asarray(x)[0], request.observation.pictures.camera)
     point = camera.world_from_camera[:3] @ np.array([0.0, 0.0, 1.5, 1.0])
     drawn = draw_tokens(black, point[None], np.array([0]), camera, 2)
     middle = SHOWN // 2 + SHOWN // SIZE // 2

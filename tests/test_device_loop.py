@@ -18,9 +18,8 @@ from dsvla_jax.sim.seeds import episode_keys
 from tests.serving import SIZE, tiny_policy
 
 
-def random_policy(baseline: Baseline, words: list[str]) -> Policy:
-    """A policy that answers with poses, with random weights, beside `tiny_policy`."""
-    plain = tiny_policy(words=words)
+def random_policy(baseline: Baseline, plain: Policy) -> Policy:
+    """A policy that answers with poses, with random weights, as large as another one."""
     config = dataclasses.replace(plain.config, baseline=baseline)
     learner = make_learner(baseline, config.encoding, config.model, plain.tokenizer)
     variables = jax.tree.map(lambda x: x + 0.05, learner.initialise(jax.random.key(0)))
@@ -29,10 +28,13 @@ def random_policy(baseline: Baseline, words: list[str]) -> Policy:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["text", "poses"])
-def test_both_loops_give_the_same_episodes(kind: str):
-    environment = Environment("lamp_on", "mjx", image_size=SIZE)
+@pytest.mark.parametrize("cameras", [("front",), ("front", "wrist")])
+def test_both_loops_give_the_same_episodes(kind: str, cameras: tuple[str, ...]):
+    environment = Environment("lamp_on", "mjx", image_size=SIZE, cameras=cameras)
     words = environment.task.all_instructions()
-    policy = tiny_policy(words=words) if kind == "text" else random_policy(BehaviourCloningConfig(), words)
+    policy = tiny_policy(words=words, cameras=cameras)
+    if kind == "poses":
+        policy = random_policy(BehaviourCloningConfig(), policy)
     state = environment.reset(episode_keys(0, "validation", "lamp_on", 0, 3))
     source = SegmentationKeypoints(environment, state)
     found, problems = source(state, environment.observe(state))
@@ -45,7 +47,7 @@ def test_both_loops_give_the_same_episodes(kind: str):
         for field in ("success", "reason", "keyframes", "instruction", "answers"):
             assert getattr(one, field) == getattr(other, field)
         np.testing.assert_allclose(one.targets, other.targets, atol=1e-6)
-        np.testing.assert_array_equal(one.frames[-1], other.frames[-1])
+        np.testing.assert_array_equal(one.views[-1].rgb, other.views[-1].rgb)
     assert len({answer for outcome in on_host for answer in outcome.answers}) > 1
 
 

@@ -54,11 +54,13 @@ def test_the_example_of_own_demonstrations_works(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines() == ["6 samples: pick up the block"] * 3
     frame = EpisodeReader("data/mine").frame(0)
     # The keypoint is in the block: what is seen where it projects to is red and nearer than the table.
-    camera = Camera(jnp.asarray(frame.picture.camera.intrinsics), jnp.asarray(frame.picture.camera.world_from_camera))
+    camera = Camera(
+        jnp.asarray(frame.pictures.camera.intrinsics[0]), jnp.asarray(frame.pictures.camera.world_from_camera[0])
+    )
     pixel, depth = project(frame.keypoint[0], camera)
     u, v = np.rint(np.asarray(pixel)).astype(int)
-    np.testing.assert_array_equal(frame.picture.rgb[v, u], [200, 40, 40])
-    np.testing.assert_allclose(np.array([frame.picture.depth[v, u], float(depth)]), 0.95, atol=1e-4)
+    np.testing.assert_array_equal(frame.pictures.rgb[0][v, u], [200, 40, 40])
+    np.testing.assert_allclose(np.array([frame.pictures.depth[0][v, u], float(depth)]), 0.95, atol=1e-4)
 
 
 @pytest.mark.parametrize("page", [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"], ids=lambda page: page.name)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dsvla_jax.checkpoints.storage import CheckpointError
+from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.errors import UserError
@@ -24,10 +25,11 @@ from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.sharding import make_mesh
 from dsvla_jax.training.state import make_optimizer
-from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers
+from dsvla_jax.weights.backbones import import_backbones, load_backbones, read_towers, require_base
 from dsvla_jax.weights.base_variables import base_variables
 from tests.learning import start_of, step_of
-from tests.run_folders import write_run
+from tests.run_folders import MODEL, TOKENIZER, write_run
+from tests.small import small_encoding
 from tests.test_training import NO_NUMBERS, VOCABULARY, random_batch, small_experiment
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -151,7 +153,7 @@ def test_a_model_with_eight_bit_kernels_is_the_model_with_their_values():
     full = {**variables, "params": dequantize(variables["params"])}
     batch = random_batch(experiment)
     example = jax.tree.map(jnp.asarray, batch)
-    inputs = model_inputs(example.picture, example.text, experiment.encoding)
+    inputs = model_inputs(example.pictures, example.text, experiment.encoding)
 
     @jax.jit
     def run(params, lora):
@@ -241,3 +243,29 @@ def test_remat_policies_are_those_of_jax():
     assert len(names) > 2
     for name in names:
         assert callable(getattr(jax.checkpoint_policies, str(REMAT_POLICIES.get(name, name))))
+
+
+def test_a_base_of_one_camera_serves_a_model_of_two(tmp_path: Path):
+    """The embeddings of cameras start at zero and learn, whatever else is frozen; all else is the base's."""
+    write_run(tmp_path / "base", MODEL, "full")
+    model = dataclasses.replace(MODEL, cameras=2)
+    require_base(tmp_path / "base", model)
+    base = base_variables(str(tmp_path / "base"), model, TOKENIZER, True, make_mesh(MESH, jax.devices()[:1]))
+    experiment = dataclasses.replace(
+        small_experiment(regime="lora"),
+        encoding=small_encoding(),
+        model=model,
+        data=DataConfig(cameras=("front", "wrist")),
+    )
+    optimizer = make_optimizer(experiment.optimizer, experiment.steps)
+    state, frozen = start_of(experiment, None, optimizer, base)
+    embedding = state.trainable["params"]["vision"].pop("camera_embedding")
+    assert not embedding.any()
+    assert embedding.shape == (2, MODEL.vision.width)
+    assert not state.trainable["params"]["vision"]
+    np.testing.assert_array_equal(
+        frozen["params"]["vision"]["positional_embedding"], base["params"]["vision"]["positional_embedding"]
+    )
+    write_run(tmp_path / "two", model, "full")
+    with pytest.raises(CheckpointError, match="vision/camera_embedding"):
+        require_base(tmp_path / "two", MODEL)

@@ -98,7 +98,7 @@ def test_pictures_prompts_and_answers_are_those_of_training(folder, tmp_path, ta
         zip(batch.text.tokens, batch.text.mask, batch.answer_mask, strict=True)
     ):
         prompt = tokenizer.decode([int(token) for token in tokens[mask & ~answer]][1:])
-        seen[prompt, tokenizer.decode([int(token) for token in tokens[answer]][:-1])] = batch.picture.rgb[row]
+        seen[prompt, tokenizer.decode([int(token) for token in tokens[answer]][:-1])] = batch.pictures.rgb[row, 0]
     lines = [
         tokenizer.decode(tokenizer.encode(line.strip()))
         for block in re.findall(r"<pre>(.*?)</pre>", text, re.S)

@@ -58,9 +58,9 @@ def make_stream(bad: Collection[int]):
     def sample(number: int, rng: np.random.Generator) -> Example[np.ndarray]:
         one = jax.tree.map(lambda leaf: leaf[0], random_batch(EXPERIMENT))
         tokens = rng.integers(4, VOCABULARY, one.text.tokens.shape).astype(np.int32)
-        camera = one.picture.camera
+        camera = one.pictures.camera
         seen = replace(camera, world_from_camera=camera.world_from_camera * np.float32(np.nan if number in bad else 1))
-        return replace(one, picture=replace(one.picture, camera=seen), text=replace(one.text, tokens=tokens))
+        return replace(one, pictures=replace(one.pictures, camera=seen), text=replace(one.text, tokens=tokens))
 
     data = grain.MapDataset.range(1000).seed(EXPERIMENT.seed).random_map(sample).batch(EXPERIMENT.batch_size)
     return iter(data.to_iter_dataset(grain.ReadOptions(num_threads=0, prefetch_buffer_size=0)))
@@ -183,7 +183,7 @@ def test_a_nan_batch_is_skipped_counted_and_kept(tmp_path: Path):
     (file,) = (tmp_path / "skipped").iterdir()
     assert file.name == "step-00000004.npz"
     with np.load(file, allow_pickle=False) as batch:
-        assert np.isnan(batch["picture.camera.world_from_camera"]).any(axis=(1, 2)).tolist() == [
+        assert np.isnan(batch["pictures.camera.world_from_camera"]).any(axis=(1, 2, 3)).tolist() == [
             False,
             False,
             True,

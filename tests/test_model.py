@@ -86,7 +86,7 @@ def test_image_and_3d_tokens_reach_the_logits(forward, variables):
     inputs = make_inputs()
     logits = forward(variables, inputs)
     for changed in (
-        dataclasses.replace(inputs, image=inputs.image + 1.0),
+        dataclasses.replace(inputs, images=inputs.images + 1.0),
         dataclasses.replace(inputs, point_tokens=inputs.point_tokens * 2),
         dataclasses.replace(inputs, point_patches=(inputs.point_patches + 1) % PATCHES),
     ):
@@ -336,7 +336,52 @@ def test_impossible_configs_say_why(make, message):
 
 def test_wrong_input_shapes_say_what_was_expected(variables):
     inputs = make_inputs()
-    with pytest.raises(ValueError, match=r"image: expected \(B, 32, 32, 3\), got \(2, 16, 16, 3\)"):
-        VLA(CONFIG).apply(variables, dataclasses.replace(inputs, image=jnp.zeros((2, 16, 16, 3))))
+    with pytest.raises(ValueError, match=r"images: expected \(B, 1, 32, 32, 3\), got \(2, 1, 16, 16, 3\)"):
+        VLA(CONFIG).apply(variables, dataclasses.replace(inputs, images=jnp.zeros((2, 1, 16, 16, 3))))
     with pytest.raises(ValueError, match="point_tokens: expected width 32"):
         VLA(CONFIG).apply(variables, dataclasses.replace(inputs, point_tokens=jnp.zeros((2, 6, 16))))
+
+
+def with_cameras(cameras: int) -> ModelConfig:
+    return dataclasses.replace(CONFIG, cameras=cameras)
+
+
+def test_only_a_model_of_several_cameras_has_an_embedding_for_each():
+    one, two = (
+        jax.eval_shape(lambda count=count: initialize(with_cameras(count), jax.random.key(0)))["params"]
+        for count in (1, 2)
+    )
+    assert "camera_embedding" not in one["vision"]
+    assert two["vision"].pop("camera_embedding").shape == (2, CONFIG.vision.width)
+    assert jax.tree.map(lambda leaf: leaf.shape, two) == jax.tree.map(lambda leaf: leaf.shape, one)
+
+
+def test_exchanging_cameras_with_their_embeddings_exchanges_their_outputs():
+    config = with_cameras(2)
+    variables = initialize(config, jax.random.key(0))
+    vision = variables["params"]["vision"]
+    embedding = jax.random.normal(jax.random.key(1), vision["camera_embedding"].shape)
+    inputs = random_inputs(CONFIG.vision, range(4, 9), np.array([3, 3]), 3, points=5, cameras=2)
+    swapped_patches = (inputs.point_patches + PATCHES) % (2 * PATCHES)
+    exchanged = dataclasses.replace(inputs, images=inputs.images[:, ::-1], point_patches=swapped_patches)
+
+    def outputs(inputs: ModelInputs, embedding: jax.Array) -> np.ndarray:
+        params = {**variables["params"], "vision": {**vision, "camera_embedding": embedding}}
+        tower: Any = VLA(config).apply({**variables, "params": params}, inputs, method=VLA.encode_vision)
+        return np.asarray(tower)
+
+    first, second = outputs(inputs, embedding), outputs(exchanged, embedding[::-1])
+    order = np.concatenate(
+        [[0], 1 + PATCHES + np.arange(PATCHES), 1 + np.arange(PATCHES), 1 + 2 * PATCHES + np.arange(5)]
+    )
+    np.testing.assert_allclose(second[:, order], first, atol=1e-5)
+    # A 3D token has its camera's embedding: another camera's patch at the same place is another place.
+    other = outputs(dataclasses.replace(inputs, point_patches=swapped_patches), embedding)
+    assert np.abs(other - first)[:, 1 + 2 * PATCHES :].max() > 1e-3
+    np.testing.assert_allclose(
+        outputs(inputs, jnp.zeros_like(embedding))[:, 1 + 2 * PATCHES :],
+        outputs(dataclasses.replace(inputs, point_patches=swapped_patches), jnp.zeros_like(embedding))[
+            :, 1 + 2 * PATCHES :
+        ],
+        atol=1e-5,
+    )

@@ -46,7 +46,7 @@ def imported(tmp_path_factory):
 def text_inputs(config: ModelConfig) -> ModelInputs:
     tokens = jnp.asarray(OUTPUTS["tokens"], jnp.int32)[None]
     return ModelInputs(
-        image=jnp.asarray(OUTPUTS["image"]),
+        images=jnp.asarray(OUTPUTS["image"])[:, None],
         point_tokens=jnp.zeros((1, 0, config.vision.width)),
         point_patches=jnp.zeros((1, 0), jnp.int32),
         text=Text(tokens, jnp.ones_like(tokens, bool)),

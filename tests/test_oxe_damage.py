@@ -281,7 +281,7 @@ def test_damage_is_named_and_left_out_only_on_request(tmp_path, capsys, kind):
     assert message.split(":")[0] in str(loader.left_out[0])
     assert capsys.readouterr().err.count("left out (1): ") == 1
     for _ in range(2 * index.num_samples // 4):
-        assert np.isfinite(next(loader).picture.rgb).all()
+        assert np.isfinite(next(loader).pictures.rgb).all()
     assert len(loader.left_out) == 1
     prepare(skipping)
     printed = capsys.readouterr().out

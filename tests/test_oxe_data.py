@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -94,7 +95,7 @@ def test_red_and_blue_are_put_right_where_the_copies_are_as_published(tmp_path, 
     write_fixture(tmp_path, name, episodes=9, steps=9)
     loader = make(tmp_path, (name,), streams=1, threads=0, crop=1.0, colour_variation=0.0, colours_mended=mended)
     places = [loader.source[i] for i in range(4)]
-    for rgb, place in zip(next(loader).picture.rgb, places, strict=True):
+    for rgb, place in zip(next(loader).pictures.rgb[:, 0], places, strict=True):
         known, step = truth_of(name, place.where)
         red, green, blue = known.colour(step)
         expected = (blue, green, red) if mended else (red, green, blue)
@@ -151,10 +152,10 @@ def test_calibrated_depth_feeds_the_3d_path(folder):
     encoding = dataclasses.replace(ENCODING, use_points=True)
     loader = make(folder, (MANISKILL,), encoding=encoding, image_size=64, crop=0.6, streams=1, threads=0)
     batch = next(loader)
-    assert batch.picture.depth.shape == (4, 64, 64)
-    np.testing.assert_allclose(batch.picture.depth, DEPTH_COUNTS / 1024)
+    assert batch.pictures.depth.shape == (4, 1, 64, 64)
+    np.testing.assert_allclose(batch.pictures.depth, DEPTH_COUNTS / 1024)
     world_from_camera = np.linalg.inv(camera_from_world())
-    camera = batch.picture.camera
+    camera = jax.tree.map(lambda x: x[:, 0], batch.pictures.camera)
     for intrinsics, pose in zip(camera.intrinsics, camera.world_from_camera, strict=True):
         np.testing.assert_allclose(pose, world_from_camera, atol=1e-6)
         # The camera looks straight down from 1.5 m onto z = 0, so each pixel's point has z = 0, and a crop that moves

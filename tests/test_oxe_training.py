@@ -68,7 +68,11 @@ def test_the_documented_sequence(tmp_path: Path):
     assert saved["scale"] == {"low": list(scale.low), "high": list(scale.high)}
     pose = np.array([[[0.3, -0.1, 1.1, 0, 1, 0, 0]]], np.float32)
     observation = Observation(
-        Picture(jnp.zeros((1, 96, 96, 3), jnp.uint8), jnp.zeros((1, 1, 1)), Camera(jnp.eye(3)[None], jnp.eye(4)[None])),
+        Picture(
+            jnp.zeros((1, 1, 96, 96, 3), jnp.uint8),
+            jnp.zeros((1, 1, 1, 1)),
+            Camera(jnp.eye(3)[None, None], jnp.eye(4)[None, None]),
+        ),
         RobotState(jnp.asarray(pose), jnp.ones((1, 1))),
     )
     bare = TextPolicy(dataclasses.replace(policy.config, displacement=None), policy.variables, policy.tokenizer)

@@ -72,7 +72,7 @@ def test_training_step_has_consistent_shapes(shapes):
     step = step_of(EXPERIMENT, optimizer, targets)
     state = jax.eval_shape(lambda tree: start_state(tree, optimizer, EXPERIMENT.seed), trainable)
     size = EXPERIMENT.data.image_size
-    batch = example_spec(EXPERIMENT.encoding, EXPERIMENT.batch_size, size, size)
+    batch = example_spec(EXPERIMENT.encoding, EXPERIMENT.batch_size, 1, size, size)
     after, metrics = jax.eval_shape(step, state, frozen, batch)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
     assert metrics["loss"].shape == ()

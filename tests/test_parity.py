@@ -106,7 +106,7 @@ def our_language(model: ModelConfig, variables: Any, batch: dict[str, np.ndarray
 
 def our_vision(model: ModelConfig, variables: Any, image: np.ndarray) -> Any:
     no_points = jnp.zeros((len(image), 0, model.vision.width)), jnp.zeros((len(image), 0), jnp.int32)
-    return jax.jit(VisionTower(model).apply)(variables, image, *no_points)
+    return jax.jit(VisionTower(model).apply)(variables, image[:, None], *no_points)
 
 
 @pytest.mark.parametrize("name", LANGUAGES)

@@ -167,16 +167,15 @@ def test_the_simulators_masks_are_of_the_objects_that_are_named():
     """The button of the lamp, of which the simulator knows where it is."""
     environment = Environment("lamp_on", image_size=128)
     state = environment.reset(episode_keys(0, "validation", "lamp_on", 0, 2))
-    masks, seen = object_masks(environment, state), environment.observe(state)
+    seen = environment.render(state)
+    masks = object_masks(environment, state, seen)
     assert masks.shape == (2, 1, 128, 128)
     for i, top in enumerate(np.asarray(environment.keypoints(state))[:, 0, 0]):
         camera = front_camera(128)
-        found = locate(Sighting("button", masks[i, 0]), np.asarray(seen.picture.depth)[i], camera)
+        found = locate(Sighting("button", masks[i, 0]), np.asarray(seen.depth)[i], camera)
         # The keypoint is the button's top; its dome, 24 mm in radius, is seen from the side.
         assert np.linalg.norm(found.point - top) < 0.024
-        assert np.all(
-            np.asarray(seen.picture.rgb)[i][masks[i, 0]][:, 1] > np.asarray(seen.picture.rgb)[i][masks[i, 0]][:, 0]
-        )
+        assert np.all(np.asarray(seen.rgb)[i][masks[i, 0]][:, 1] > np.asarray(seen.rgb)[i][masks[i, 0]][:, 0])
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -201,8 +200,8 @@ def test_recorded_episodes_get_the_keypoints_of_their_first_picture():
         seed=0,
         rgb_png=tuple(pictures),
         depth_png=(encode_depth(depth),) * 2,
-        intrinsics=np.stack([CAMERA.intrinsics] * 2),
-        world_from_camera=np.stack([CAMERA.world_from_camera] * 2),
+        intrinsics=np.stack([CAMERA.intrinsics[None]] * 2),
+        world_from_camera=np.stack([CAMERA.world_from_camera[None]] * 2),
         pose=pose,
         gripper_open=np.ones((2, 1), np.float32),
         target_pose=pose,

@@ -161,6 +161,18 @@ def test_flops_counted_by_hand_are_those_of_the_traced_step(fusion, regime, rema
     assert 0.97 < traced_flops(experiment) / counted < 1.03
 
 
+@pytest.mark.parametrize("fusion", ["adapter", "prefix"])
+def test_flops_of_two_cameras_are_those_of_the_traced_step(fusion):
+    experiment = in_16_bits(fusion)
+    experiment = dataclasses.replace(
+        experiment,
+        model=dataclasses.replace(experiment.model, cameras=2),
+        data=dataclasses.replace(experiment.data, cameras=("front", "wrist")),
+    )
+    counted = sum(training_flops(*parts(experiment)).values()) * experiment.batch_size
+    assert 0.97 < traced_flops(experiment) / counted < 1.03
+
+
 def test_utilisation_does_not_count_what_is_computed_again():
     plain = in_16_bits("prefix")
     assert plain.model.remat == "none"

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.encoding.alignment import align_to_patches
+from dsvla_jax.encoding.alignment import AlignmentMode, align_to_patches
 from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.encode import CLIP_MEAN, CLIP_STD, build_prompt, encode_text, model_inputs, normalize_image
 from dsvla_jax.encoding.farthest_point import farthest_point_sample
@@ -15,7 +15,7 @@ from dsvla_jax.encoding.point_tokens import PointTokenizerConfig, positional_enc
 from dsvla_jax.encoding.prompts import Style, format_answer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.geometry.cameras import front_camera, unproject
-from dsvla_jax.types import Array, Picture, RobotState, Text
+from dsvla_jax.types import Array, Camera, Picture, RobotState, Text
 
 LOW, HIGH = (-1.5, -1.5, 0.76), (1.5, 1.5, 3.0)
 SMALL = PointTokenizerConfig(num_points=64, group_sizes=(32, 16, 9), neighbours=5, width=96)
@@ -195,6 +195,12 @@ def test_impossible_tokenizers_are_refused(change, message):
         dataclasses.replace(SMALL, **change)
 
 
+def aligned(points: Array, camera: Camera, size: int, grid: int, mode: AlignmentMode = "aligned") -> Array:
+    """The patches of points that one camera, of square pictures, sees."""
+    cameras = jax.tree.map(lambda x: x[None], camera)
+    return align_to_patches(points, jnp.zeros(len(points), int), cameras, size, size, grid, mode)
+
+
 @pytest.mark.parametrize("size", [336, 672])
 @pytest.mark.parametrize(
     ("point", "pixel"),
@@ -209,23 +215,21 @@ def test_impossible_tokenizers_are_refused(change, message):
 def test_alignment_golden_pixels(point, pixel, size):
     # The pixels are those of a 336 px image; the same patch must come out whatever the size the picture was taken at.
     column, row = ((np.array(pixel) * size / 336 + 0.5) * 24 / size).astype(int)
-    assert align_to_patches(jnp.array([point]), front_camera(size), size, size, 24, "aligned").tolist() == [
-        row * 24 + column
-    ]
+    assert aligned(jnp.array([point]), front_camera(size), size, 24).tolist() == [row * 24 + column]
 
 
 @pytest.mark.parametrize("size", [48, 96])
 def test_every_pixel_of_a_depth_map_comes_back_to_its_own_patch(size):
     camera = front_camera(size)
     depth = np.random.default_rng(0).uniform(0.5, 3.0, (size, size)).astype(np.float32)
-    patches = align_to_patches(unproject(depth, camera).reshape(-1, 3), camera, size, size, 6, "aligned")
+    patches = aligned(unproject(depth, camera).reshape(-1, 3), camera, size, 6)
     row, column = np.divmod(np.arange(size * size), size)
     np.testing.assert_array_equal(patches, row // (size // 6) * 6 + column // (size // 6))
 
 
 def test_points_out_of_view_take_a_patch_of_the_border():
     points = jnp.array([[0.25, 5.0, 0.8], [0.25, -5.0, 0.8], [3.0, 0.3, 0.8]])
-    row, column = np.divmod(np.asarray(align_to_patches(points, front_camera(96), 96, 96, 6, "aligned")), 6)
+    row, column = np.divmod(np.asarray(aligned(points, front_camera(96), 96, 6)), 6)
     assert column[0] == 5
     assert column[1] == 0
     assert (row >= 0).all()
@@ -234,22 +238,22 @@ def test_points_out_of_view_take_a_patch_of_the_border():
 
 def test_index_order_and_unknown_modes():
     camera = front_camera(96)
-    assert align_to_patches(jnp.zeros((5, 3)), camera, 96, 96, 6, "index_order").tolist() == [0, 1, 2, 3, 4]
+    assert aligned(jnp.zeros((5, 3)), camera, 96, 6, "index_order").tolist() == [0, 1, 2, 3, 4]
     with pytest.raises(ValueError, match="at most 4 3D tokens"):
-        align_to_patches(jnp.zeros((5, 3)), camera, 96, 96, 2, "index_order")
+        aligned(jnp.zeros((5, 3)), camera, 96, 2, "index_order")
     with pytest.raises(ValueError, match="one of aligned, index_order, got 'virtual_views'"):
-        align_to_patches(jnp.zeros((5, 3)), camera, 96, 96, 2, "virtual_views")  # pyright: ignore[reportArgumentType]
+        aligned(jnp.zeros((5, 3)), camera, 96, 2, "virtual_views")  # pyright: ignore[reportArgumentType]
 
 
 CONFIG = EncodingConfig(image_size=32, patch_size=8, points=SMALL, style="compact", max_text_length=40)
 
 
-def picture(size: int, batch: int = 2) -> Picture[Array]:
+def pictures(size: int, batch: int = 2) -> Picture[Array]:
     rng = np.random.default_rng(0)
     return Picture(
-        jnp.asarray(rng.integers(0, 256, (batch, size, size, 3)), jnp.uint8),
-        jnp.asarray(rng.uniform(0.8, 1.6, (batch, size, size)), jnp.float32),
-        jax.tree.map(lambda leaf: jnp.stack([leaf] * batch), front_camera(size)),
+        jnp.asarray(rng.integers(0, 256, (batch, 1, size, size, 3)), jnp.uint8),
+        jnp.asarray(rng.uniform(0.8, 1.6, (batch, 1, size, size)), jnp.float32),
+        jax.tree.map(lambda leaf: jnp.stack([leaf[None]] * batch), front_camera(size)),
     )
 
 
@@ -258,15 +262,15 @@ def text(batch: int = 2) -> Text[Array]:
 
 
 def test_a_picture_and_a_text_become_model_inputs_under_jit():
-    inputs = jax.jit(model_inputs, static_argnums=2)(picture(32), text(), CONFIG)
-    assert inputs.image.shape == (2, 32, 32, 3)
+    inputs = jax.jit(model_inputs, static_argnums=2)(pictures(32), text(), CONFIG)
+    assert inputs.images.shape == (2, 1, 32, 32, 3)
     assert inputs.point_tokens.shape == (2, 9, 96)
     assert inputs.point_patches.shape == (2, 9)
     jax.tree.map(np.testing.assert_array_equal, inputs.text, text())
-    expected = (np.asarray(picture(32).rgb, np.float32) / 255 - CLIP_MEAN) / CLIP_STD
-    np.testing.assert_allclose(inputs.image, expected, atol=1e-5)
+    expected = (np.asarray(pictures(32).rgb, np.float32) / 255 - CLIP_MEAN) / CLIP_STD
+    np.testing.assert_allclose(inputs.images, expected, atol=1e-5)
     # The tokens are those of the cloud in farthest-point order, and each carries the patch of its own centre.
-    points, valid = cloud_from_depth(picture(32).depth[1], front_camera(32), LOW, HIGH, stride=2)
+    points, valid = cloud_from_depth(pictures(32).depth[1, 0], front_camera(32), LOW, HIGH, stride=2)
     order = brute_force_fps(np.asarray(points), np.asarray(valid), 64)
     tokens, centers = jax.jit(tokenize_points, static_argnums=1)(np.asarray(points)[order], SMALL)
     np.testing.assert_allclose(inputs.point_tokens[1], tokens, atol=1e-3)
@@ -276,18 +280,18 @@ def test_a_picture_and_a_text_become_model_inputs_under_jit():
 
 
 def test_model_inputs_take_other_image_sizes_and_no_points():
-    shapes = jax.eval_shape(lambda seen: model_inputs(seen, text(), CONFIG), picture(48))
-    assert shapes.image.shape == (2, 32, 32, 3)
+    shapes = jax.eval_shape(lambda seen: model_inputs(seen, text(), CONFIG), pictures(48))
+    assert shapes.images.shape == (2, 1, 32, 32, 3)
     assert shapes.point_tokens.shape == (2, 9, 96)
-    flat = dataclasses.replace(picture(48), rgb=jnp.full((2, 48, 48, 3), 51, jnp.uint8))
+    flat = dataclasses.replace(pictures(48), rgb=jnp.full((2, 1, 48, 48, 3), 51, jnp.uint8))
     inputs = model_inputs(flat, text(), dataclasses.replace(CONFIG, use_points=False))
     np.testing.assert_allclose(
-        inputs.image, np.broadcast_to((0.2 - np.array(CLIP_MEAN)) / CLIP_STD, (2, 32, 32, 3)), atol=1e-5
+        inputs.images, np.broadcast_to((0.2 - np.array(CLIP_MEAN)) / CLIP_STD, (2, 1, 32, 32, 3)), atol=1e-5
     )
     assert inputs.point_tokens.shape == (2, 0, 96)
     assert inputs.point_patches.shape == (2, 0)
     with pytest.raises(ValueError, match=r"at most the 16 points of a depth map of 16 x 16 pixels with .*stride 4"):
-        model_inputs(picture(16), text(), dataclasses.replace(CONFIG, stride=4))
+        model_inputs(pictures(16), text(), dataclasses.replace(CONFIG, stride=4))
     with pytest.raises(ValueError, match=r"expected a batch of uint8 images .* float32"):
         normalize_image(jnp.zeros((2, 32, 32, 3)), 32)
 

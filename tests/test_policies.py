@@ -50,21 +50,21 @@ BASELINES = {
 def poses(rng: np.random.Generator, *shape: int) -> np.ndarray:
     """Random poses inside the box, with canonical quaternions."""
     place = rng.uniform(CODEC.low, CODEC.high, (*shape, 3))
-    turn = Rotation.random(int(np.prod(shape)), random_state=1).as_quat(canonical=True).reshape(*shape, 4)
+    turn = Rotation.from_quat(rng.normal(size=(int(np.prod(shape)), 4))).as_quat(canonical=True).reshape(*shape, 4)
     return np.concatenate([place, turn], axis=-1).astype(np.float32)
 
 
 def example(rng: np.random.Generator, count: int, arms: int = 1, upcoming: int = 1) -> PoseExample[np.ndarray]:
     """A batch of examples of random frames."""
     sample = make_pose_sampler(DataConfig(keypoint_noise=0.0), TOKENIZER, 12, True, upcoming)
-    camera = jax.tree.map(np.asarray, front_camera(32))
+    camera = jax.tree.map(lambda x: np.asarray(x)[None], front_camera(32))
     examples = []
     for number in range(count):
         frame = decode_frame(random_episode(number, arms=arms, frames=2, size=32), 0)
         turn, goal = poses(rng, arms), poses(rng, arms)
         frame = dataclasses.replace(
             frame,
-            picture=dataclasses.replace(frame.picture, camera=camera),
+            pictures=dataclasses.replace(frame.pictures, camera=camera),
             robot=dataclasses.replace(frame.robot, pose=turn),
             target=dataclasses.replace(frame.target, pose=goal),
             later=None,
@@ -154,8 +154,8 @@ def learner(baseline: Baseline) -> Any:
 def test_a_missing_arm_changes_no_loss_and_parts_add_up(name: str):
     baseline = BASELINES[name]
     policy, batch = learner(baseline), example(np.random.default_rng(0), 4, upcoming=baseline.upcoming)
-    assert jax.tree.structure(policy.example_spec(4, 32, 32)) == jax.tree.structure(batch)
-    for spec, leaf in zip(jax.tree.leaves(policy.example_spec(4, 32, 32)), jax.tree.leaves(batch), strict=True):
+    assert jax.tree.structure(policy.example_spec(4, 1, 32, 32)) == jax.tree.structure(batch)
+    for spec, leaf in zip(jax.tree.leaves(policy.example_spec(4, 1, 32, 32)), jax.tree.leaves(batch), strict=True):
         assert (spec.shape, spec.dtype) == (leaf.shape, leaf.dtype)
     variables = policy.initialise(jax.random.key(0))
     totals, key = policy.totals(batch), jax.random.key(1)
@@ -176,13 +176,13 @@ def test_a_policy_answers_the_same_in_any_company_and_always(name: str):
     robot = dataclasses.replace(
         batch.inputs.robot, pose=batch.inputs.robot.pose[:, :1], gripper_open=batch.inputs.robot.gripper_open[:, :1]
     )
-    observation, near = Observation(batch.inputs.picture, robot), batch.inputs.keypoints[:, :1]
+    observation, near = Observation(batch.inputs.pictures, robot), batch.inputs.keypoints[:, :1]
     decision = policy.decide(observation, ["turn the lamp on"] * 3, near)
     again = policy.decide(observation, ["turn the lamp on"] * 3, near)
     np.testing.assert_array_equal(decision.action.pose, again.action.pose)
     assert decision.action.pose.shape == (3, 1, 7)
     assert [len(text.split()) for text in decision.texts] == [8] * 3
-    alone = policy.decide(*jax.tree.map(lambda x: x[1:2], (observation,)), ["turn the lamp on"], near[1:2])
+    alone = policy.decide(jax.tree.map(lambda x: x[1:2], observation), ["turn the lamp on"], near[1:2])
     np.testing.assert_allclose(alone.action.pose[0], decision.action.pose[1], atol=1e-4)
     on_device = policy.on_device(1, ["turn the lamp on"])
     question = on_device.ask(["turn the lamp on"] * 3)
@@ -198,7 +198,8 @@ def test_the_points_order_does_not_matter_to_dp3():
     encoder = PointEncoder((16, 32), 8)
     variables = encoder.init(jax.random.key(1), points)
     shuffled = points[:, jax.random.permutation(jax.random.key(2), 40)]
-    np.testing.assert_allclose(encoder.apply(variables, points), encoder.apply(variables, shuffled), atol=1e-6)
+    one, other = (np.asarray(encoder.apply(variables, x)) for x in (points, shuffled))
+    np.testing.assert_allclose(one, other, atol=1e-6)
 
 
 def train(baseline: Baseline, batch: PoseExample[np.ndarray], steps: int, rate: float) -> tuple[Any, TrainState]:

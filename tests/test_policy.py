@@ -45,7 +45,7 @@ def batch(size: int) -> tuple[Observation, list[str], np.ndarray]:
     stacked: Any = {name: np.stack([request[name] for request in requests]) for name in requests[0] if name != "prompt"}
     camera = Camera(stacked["intrinsics"], stacked["world_from_camera"])
     robot = RobotState(stacked["pose"], stacked["gripper_open"])
-    observed = Observation(Picture(stacked["rgb"], stacked["depth"], camera), robot)
+    observed = Observation(jax.tree.map(lambda x: x[:, None], Picture(stacked["rgb"], stacked["depth"], camera)), robot)
     return observed, [PROMPTS[seed % len(PROMPTS)] for seed in range(size)], stacked["keypoints"][:, :, 0]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.episodes import EpisodeReader
-from data_pipelines.recording import Recording
+from data_pipelines.recording import CameraRecording, Recording
 from data_pipelines.records import decode_frame
 from data_pipelines.writer import DemonstrationWriter
 from dsvla_jax.encoding.codec import PoseCodec
@@ -168,11 +168,11 @@ def test_a_recording_becomes_an_episode(tmp_path):
     np.testing.assert_allclose(episode.pose, GOOD.pose[starts], atol=1e-6)
     np.testing.assert_allclose(episode.target_pose, GOOD.pose[targets], atol=1e-6)
     np.testing.assert_array_equal(episode.target_gripper, GOOD.gripper_open[targets])
-    np.testing.assert_allclose(episode.world_from_camera, np.broadcast_to(CAMERA, (4, 4, 4)), atol=1e-6)
+    np.testing.assert_allclose(episode.world_from_camera[:, 0], np.broadcast_to(CAMERA, (4, 4, 4)), atol=1e-6)
     for place, start in enumerate(starts):
         frame = decode_frame(episode, place)
-        np.testing.assert_array_equal(frame.picture.rgb, GOOD.rgb[start])
-        np.testing.assert_allclose(frame.picture.depth, GOOD.depth[start], atol=1e-4)
+        np.testing.assert_array_equal(frame.pictures.rgb[0], GOOD.rgb[start])
+        np.testing.assert_allclose(frame.pictures.depth[0], GOOD.depth[start], atol=1e-4)
         np.testing.assert_allclose(frame.keypoint, [[0.2, 0, 0.8]], atol=1e-6)
 
 
@@ -181,7 +181,7 @@ def test_channels_and_quaternions_are_put_right(tmp_path):
     with DemonstrationWriter(tmp_path) as writer:
         writer.add(make_recording(rgb=np.asarray(GOOD.rgb)[..., ::-1], channels="bgr", pose=pose), keyframes=[5, 11])
     frame = EpisodeReader(tmp_path).frame(0)
-    np.testing.assert_array_equal(frame.picture.rgb, GOOD.rgb[0])
+    np.testing.assert_array_equal(frame.pictures.rgb[0], GOOD.rgb[0])
     np.testing.assert_allclose(frame.robot.pose[:, 3:], [[0, 1, 0, 0]], atol=1e-6)
 
 
@@ -278,3 +278,39 @@ def test_numbers_of_the_writer_have_their_range(tmp_path, option):
     with pytest.raises(UserError, match=f"{next(iter(option))}: expected at least 0"):
         DemonstrationWriter(tmp_path / "new", **option)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_second_camera_is_recorded_and_checked_by_its_name(tmp_path):
+    rng = np.random.default_rng(1)
+    wrist = CameraRecording(
+        list(rng.integers(0, 256, (STEPS, SIZE, SIZE, 3), np.uint8)),
+        list(rng.uniform(0.15, 0.25, (STEPS, SIZE, SIZE))),
+        GOOD.intrinsics,
+        np.stack([np.diag([1, -1, -1, 1.0])] * STEPS),
+    )
+    wrist.world_from_camera[:, :3, 3] = np.asarray(GOOD.pose)[:, 0, :3] + np.linspace(0, 0.1, STEPS)[:, None]
+    both = make_recording(other_cameras={"wrist": wrist})
+    with DemonstrationWriter(tmp_path / "two", every_n=3) as writer:
+        episode = writer.add(both, keyframes=[5, 11])
+        with pytest.raises(DataError, match=r"cameras: expected front, wrist, as in .*, got one camera; record with"):
+            writer.add(GOOD, keyframes=[5, 11])
+    reader = EpisodeReader(tmp_path / "two")
+    assert reader.cameras == episode.cameras == ("front", "wrist")
+    frame = decode_frame(reader.episode(0), 1)
+    np.testing.assert_array_equal(frame.pictures.rgb, [GOOD.rgb[3], wrist.rgb[3]])
+    np.testing.assert_allclose(frame.pictures.camera.world_from_camera[1], wrist.world_from_camera[3], atol=1e-6)
+    wrong = {
+        "observation 0, camera wrist: rgb: expected uint8": {"rgb": np.asarray(wrist.rgb) / 255.0},
+        "camera wrist: depth: expected 12 pictures": {"depth": wrist.depth[:5]},
+        "camera wrist: world_from_camera: .*mirror image": {"world_from_camera": mirrored(0)},
+        "picture size: expected one .* for all cameras": {
+            "rgb": [one[:8, :8] for one in wrist.rgb],
+            "depth": [one[:8, :8] for one in wrist.depth],
+        },
+    }
+    for complaint, changes in wrong.items():
+        bad = make_recording(other_cameras={"wrist": dataclasses.replace(wrist, **changes)})
+        with DemonstrationWriter(tmp_path / "bad") as writer, pytest.raises(DataError, match=complaint):
+            writer.add(bad, keyframes=[5, 11])
+    with DemonstrationWriter(tmp_path / "bad") as writer, pytest.raises(DataError, match="expected different names"):
+        writer.add(make_recording(other_cameras={"front": wrist}), keyframes=[5, 11])

@@ -60,16 +60,18 @@ def test_arms_keep_their_sides(imported):
 @pytest.mark.parametrize("number", [0, 3])
 def test_clouds_line_up_with_their_pictures(imported, number):
     frame = decode_frame(imported.episode(number), 1)
-    camera = Camera(jnp.asarray(frame.picture.camera.intrinsics), jnp.asarray(frame.picture.camera.world_from_camera))
-    points, valid = cloud_from_depth(frame.picture.depth, camera, (-1.0, -1.0, 0.5), (1.0, 1.0, 2.0))
+    camera = Camera(
+        jnp.asarray(frame.pictures.camera.intrinsics[0]), jnp.asarray(frame.pictures.camera.world_from_camera[0])
+    )
+    points, valid = cloud_from_depth(frame.pictures.depth[0], camera, (-1.0, -1.0, 0.5), (1.0, 1.0, 2.0))
     points, valid = np.asarray(points), np.asarray(valid)
     assert valid.mean() > 0.5
     pixels = np.asarray(project(points, camera)[0])
-    rows, columns = np.divmod(np.arange(len(points)), frame.picture.rgb.shape[1])
+    rows, columns = np.divmod(np.arange(len(points)), frame.pictures.rgb[0].shape[1])
     assert np.abs(pixels - np.stack([columns, rows], -1))[valid].max() < 0.01
     # What a point's place in the world says its colour is, is the colour of its pixel. Steps of colour are 2 mm and
     # depth is kept to 0.1 mm, so a point near a step may show the neighbouring one; a pixel is 30 mm.
-    shown = frame.picture.rgb.reshape(-1, 3).astype(int)
+    shown = frame.pictures.rgb[0].reshape(-1, 3).astype(int)
     step = (files.colour_of(points).astype(int) - shown + 128) % 256 - 128
     assert np.abs(step[valid]).max() <= 1
     assert (step[valid] == 0).mean() > 0.9

@@ -1,6 +1,7 @@
 """RLBench's data as people have them: some cameras, some pictures, other rests, archives of macOS."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -47,7 +48,7 @@ def test_a_camera_on_the_wrist_need_not_see_where_the_hand_acts(tmp_path):
     source = write_source(tmp_path / "source", on_the_wrist, episodes=2)
     for number in range(2):
         add_wrist_pictures(episode_folder(source, number))
-    reader = imported(source, tmp_path / "out", camera="wrist")
+    reader = imported(source, tmp_path / "out", cameras=("wrist",))
     assert len(reader) == 2
     pose, _, _ = files.trajectory(FRAMES)
     np.testing.assert_allclose(reader.episode(0).keypoints[0], pose[[16, 32, 39], 0, :3], atol=1e-6)
@@ -66,11 +67,11 @@ def test_a_camera_that_stands_still_and_sees_no_keypoint_is_refused_with_the_way
 def test_a_camera_that_is_not_there_is_answered_by_those_that_are(tmp_path):
     source = write_source(tmp_path / "source", on_the_wrist)
     with pytest.raises(DataError, match=r"camera: expected one of front, wrist, got 'wirst'; choose one with --camera"):
-        import_demonstrations(source, tmp_path / "out", Settings(camera="wirst"), progress=False)
+        import_demonstrations(source, tmp_path / "out", Settings(cameras=("wirst",)), progress=False)
     with pytest.raises(
         DataError, match=r"wrist_rgb: folder: expected 40 pictures, got none, but those of front; choose"
     ):
-        import_demonstrations(source, tmp_path / "out", Settings(camera="wrist"), progress=False)
+        import_demonstrations(source, tmp_path / "out", Settings(cameras=("wrist",)), progress=False)
 
 
 def keep_pictures(folder, numbers):
@@ -165,8 +166,26 @@ def test_the_variation_is_kept_and_what_is_left_aside_is_said(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("every_n", -1), ("still", -0.1), ("stop_buffer", -1), ("episodes", 0), ("episodes", -3), ("camera", "")],
+    [("every_n", -1), ("still", -0.1), ("stop_buffer", -1), ("episodes", 0), ("episodes", -3), ("cameras", ("",))],
 )
 def test_numbers_of_the_import_have_their_range(tmp_path, option, value):
-    with pytest.raises(UserError, match=rf"{option}: expected .*, got {value}"):
+    with pytest.raises(UserError, match=rf"{option}: expected .*, got {re.escape(str(value))}"):
         Options(source=tmp_path, out=tmp_path / "new", **{option: value})
+
+
+def test_two_cameras_are_imported_in_the_order_of_their_names(tmp_path, capsys):
+    """One of two that stand still must see a keypoint; the wrist camera moves, and never sees one."""
+    source = write_source(tmp_path / "source", on_the_wrist)
+    add_wrist_pictures(episode_folder(source))
+    reader = imported(source, tmp_path / "out", cameras=("wrist", "front"))
+    assert reader.cameras == ("wrist", "front")
+    assert reader.settings["cameras"] == ["wrist", "front"]
+    front = imported(source, tmp_path / "front").episode(0)
+    assert_equal_episodes(EpisodeReader(tmp_path / "out", cameras=("front",)).episode(0), front)
+    np.testing.assert_array_equal(reader.frame(0).pictures.rgb[0], reader.frame(0).pictures.rgb[1])
+    moved = reader.episode(0).world_from_camera[:, 0, :3, 3]
+    np.testing.assert_allclose(moved, reader.episode(0).pose[:, 0, :3], atol=1e-6)
+    main(Options(source=source, out=tmp_path / "out", cameras=("wrist", "front")))
+    assert "left aside" not in capsys.readouterr().out
+    with pytest.raises(DataError, match=r"settings.camera: expected 'front' as asked for, got None"):
+        import_demonstrations(source, tmp_path / "out", Settings(), progress=False)

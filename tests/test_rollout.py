@@ -1,5 +1,6 @@
 """The closed loop on the host with scripted policies: what ends an episode, and which reason is given."""
 
+import dataclasses
 import functools
 
 import jax
@@ -9,11 +10,13 @@ import pytest
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.loop import Stopped, on_host, run_episodes, run_task
+from dsvla_jax.evaluation.pictures import mark_view
 from dsvla_jax.perception.simulator import SegmentationKeypoints
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.types import Action
+from tests.serving import tiny_policy
 
 EPISODES = 4
 
@@ -120,7 +123,7 @@ def test_an_episode_ends_with_its_success():
         assert ending.success
         assert ending.reason == ""
         assert ending.keyframes == plan.pose.shape[1] == len(ending.answers) == len(ending.targets)
-        assert len(ending.frames) == ending.keyframes + 1
+        assert len(ending.views) == ending.keyframes + 1
         assert "rubbish" in ending.instruction or "trash" in ending.instruction or "paper" in ending.instruction
 
 
@@ -214,3 +217,29 @@ def test_noise_moves_the_keypoints_that_the_policy_is_told():
     for noise in (0.0, 0.05):
         run_episodes(environment("lamp_on"), act, start_of("lamp_on"), limit=1, noise=noise)
     np.testing.assert_allclose(told[1] - told[0], 0.05, atol=1e-6)
+
+
+def test_a_policy_acts_with_what_two_cameras_see():
+    cameras = ("front", "wrist")
+    lamp = Environment("lamp_on", image_size=32, cameras=cameras)
+    policy = tiny_policy(words=lamp.task.all_instructions(), cameras=cameras)
+    state = lamp.reset(episode_keys(0, "validation", "lamp_on", 0, 2))
+    seen = lamp.observe(state)
+    endings = run_episodes(lamp, policy.act, state, limit=1)
+    for i, ending in enumerate(endings):
+        assert ending.keyframes == 1
+        assert len(ending.views) == 2
+        np.testing.assert_array_equal(ending.views[0].rgb, seen.pictures.rgb[i])
+        np.testing.assert_array_equal(
+            ending.views[0].camera.world_from_camera, seen.pictures.camera.world_from_camera[i]
+        )
+        # One column of the film strip: the front camera's picture above the wrist camera's, each with the target.
+        column = mark_view(ending.views[0].rgb, ending.targets[0], ending.views[0].camera)
+        assert column.shape == (64, 32, 3)
+        np.testing.assert_array_equal(
+            mark_view(ending.views[0].rgb, None, ending.views[0].camera)[32:], seen.pictures.rgb[i, 1]
+        )
+    without = dataclasses.replace(seen, pictures=jax.tree.map(lambda x: x[:, ::-1], seen.pictures))
+    instructions, near = lamp.instructions(state), np.asarray(lamp.keypoints(state))[:, :, 0]
+    one, other = (np.asarray(policy.decide(x, instructions, near).log_probs) for x in (seen, without))
+    assert np.abs(one - other).max() > 1e-3

@@ -24,7 +24,7 @@ from dsvla_jax.perception.simulator import suite_phrases
 from dsvla_jax.serving.batching import answer_batch
 from dsvla_jax.serving.client import ConnectionFailed, PolicyClient, ServerError
 from dsvla_jax.serving.messages import MAX_CONTAINERS, MessageError, pack, unpack
-from dsvla_jax.serving.requests import BadRequest, parse_request
+from dsvla_jax.serving.requests import BadRequest, Expected, check_first_keypoints, parse_request
 from dsvla_jax.serving.server import Perception
 from dsvla_jax.serving.session import Session
 from tests.golden import serving as golden
@@ -189,7 +189,7 @@ def test_poses_may_be_lists_and_any_float(running_server):
     other = {**request, "pose": request["pose"].tolist(), "depth": request["depth"].astype(np.float64)}
     first, second = (parse_request(one, running_server[0].expected) for one in (request, other))
     assert_same(np.asarray(second.observation.robot.pose), np.asarray(first.observation.robot.pose))
-    assert_same(np.asarray(second.observation.picture.depth), np.asarray(first.observation.picture.depth))
+    assert_same(np.asarray(second.observation.pictures.depth), np.asarray(first.observation.pictures.depth))
 
 
 def test_a_robot_is_told_what_to_send_and_gets_the_policys_action(running_server, client, policy):
@@ -326,7 +326,7 @@ def test_a_policy_without_keypoints_and_3d_input_needs_neither():
 
 def test_a_policy_that_learned_without_keypoints_refuses_them():
     small = tiny_policy()
-    learned = LearnedFrom("demonstrations", "none", (SIZE, SIZE), (1,), ("lift_box",), "wrist")
+    learned = LearnedFrom("demonstrations", "none", (SIZE, SIZE), (1,), ("lift_box",), ("wrist",))
     policy = dataclasses.replace(small, config=dataclasses.replace(small.config, learned_from=learned))
     with running(lambda: small_server(policy, limits={"batch": 1})) as (_, port), PolicyClient(port=port) as client:
         assert client.metadata["needs_keypoints"] is False
@@ -486,3 +486,80 @@ def test_text_frames_and_garbage_get_an_error(running_server):
             assert complaint in reply
         connection.send(pack(observation(0)))
         assert isinstance(connection.recv(), bytes)
+
+
+CAMERAS = ("front", "wrist")
+
+
+def seen_by_two(seed: int) -> dict:
+    """A request with two pictures, the second from 20 cm beside the first."""
+    first, second = observation(seed), observation(seed + 100)
+    pose = first["world_from_camera"].copy()
+    pose[1, 3] += 0.2
+    both = {name: np.stack([first[name], second[name]]) for name in ("rgb", "depth", "intrinsics")}
+    return {**first, **both, "world_from_camera": np.stack([first["world_from_camera"], pose])}
+
+
+def test_a_policy_of_two_cameras_is_asked_with_both_pictures():
+    policy = tiny_policy(cameras=CAMERAS)
+    with running(lambda: small_server(policy)) as (server, port), PolicyClient(port=port) as client:
+        assert client.metadata["cameras"] == list(CAMERAS)
+        assert client.metadata["learned_from"]["cameras"] == list(CAMERAS)
+        assert client.metadata["request"]["rgb"] == "uint8 (2, H, W, 3), of each of front, wrist"
+        request = seen_by_two(1)
+        parsed = parse_request(request, server.expected)
+        question, _ = asyncio.run(server._question(parsed, Session()))
+        reply = client.infer(request)
+        assert reply["text"] == answer_batch(policy, [question])[0].text
+        alone = [
+            parse_request({**request, **{k: request[k][c] for k in TAKEN}}, one_camera()).points or 0 for c in range(2)
+        ]
+        assert reply["points"] == sum(alone)
+        changed = {**request, "rgb": request["rgb"][::-1]}
+        assert client.infer(changed)["log_probs"] != reply["log_probs"]
+        refused = {
+            r"rgb: expected a uint8 array \(2, 32, 32, 3\) of front, wrist, got uint8 \(32, 32, 3\)": {
+                "rgb": request["rgb"][0]
+            },
+            r"request, camera wrist: intrinsics: expected a centre in 32 x 32 pixels": {
+                "intrinsics": request["intrinsics"] * np.array([1, 3])[:, None, None] ** np.array([1, 1, 0])[:, None]
+            },
+            r"request, camera front: world_from_camera: .*mirror image": {
+                "world_from_camera": request["world_from_camera"]
+                * np.array([-1, 1, 1, 1])
+                * np.array([[1], [0]])[:, None]
+                + request["world_from_camera"] * np.array([[0], [1]])[:, None]
+            },
+            r"depth: expected float \(2, H, W\).*, of each of front, wrist, got shape \(32, 32\)": {
+                "depth": request["depth"][0]
+            },
+        }
+        for complaint, changes in refused.items():
+            with pytest.raises(ServerError, match=complaint):
+                client.infer({**request, **changes})
+
+
+TAKEN = ("rgb", "depth", "intrinsics", "world_from_camera")
+
+
+def one_camera() -> Expected:
+    return Expected(((SIZE, SIZE),), (1,), tiny_policy().config.encoding)
+
+
+def test_one_of_two_cameras_must_see_a_keypoint_at_first():
+    expected = dataclasses.replace(one_camera(), cameras=CAMERAS)
+    request = seen_by_two(1)
+    request["world_from_camera"][0] = request["world_from_camera"][0] @ np.diag([1, -1, -1, 1])
+    turned = parse_request(
+        {**request, "depth": request["depth"] * 0 + 1}, dataclasses.replace(expected, encoding=BLIND)
+    )
+    assert turned.keypoints is not None
+    check_first_keypoints(turned, turned.keypoints)
+    both = request["world_from_camera"].copy()
+    both[1] = both[0]
+    away = parse_request({**request, "world_from_camera": both}, dataclasses.replace(expected, encoding=BLIND))
+    with pytest.raises(BadRequest, match="keypoints"):
+        check_first_keypoints(away, turned.keypoints)
+
+
+BLIND = dataclasses.replace(tiny_policy().config.encoding, use_points=False)

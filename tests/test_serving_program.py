@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import os
 import socket
 import subprocess
@@ -115,8 +116,8 @@ def test_a_token_file_is_read_as_people_write_it(tmp_path, run_of_own_demonstrat
 def test_demonstrations_say_what_a_policy_learns_from(tmp_path):
     files.write_dataset(tmp_path / "source", ["lamp_on"], episodes=1, size=24, frames=12, descriptions=["press it"])
     for settings, expected in (
-        (Settings(), LearnedFrom("demonstrations", "recorded", (24, 24), (1,), ("lamp_on",), "front")),
-        (Settings(keypoints="none"), LearnedFrom("demonstrations", "none", (24, 24), (1,), ("lamp_on",), "front")),
+        (Settings(), LearnedFrom("demonstrations", "recorded", (24, 24), (1,), ("lamp_on",), ("front",))),
+        (Settings(keypoints="none"), LearnedFrom("demonstrations", "none", (24, 24), (1,), ("lamp_on",), ("front",))),
     ):
         folder = tmp_path / settings.keypoints
         import_demonstrations(tmp_path / "source", folder, settings, progress=False)
@@ -179,3 +180,27 @@ def test_the_example_runs_as_a_script_from_anywhere(tmp_path):
     assert ended.returncode == 1
     assert ended.stderr.startswith(f"error: ws://127.0.0.1:{port}: ")
     assert "start a server (python -m dsvla_jax.serving RUN)" in ended.stderr
+
+
+def test_the_only_camera_has_the_name_that_it_had(tmp_path):
+    """In the metadata of a server, and in a policy.json of an earlier version."""
+    run = write_run(tmp_path / "run", dataclasses.replace(OWN, cameras=("wrist",)))
+    metadata = build_server(Options(run)).metadata
+    assert metadata["learned_from"]["camera"] == "wrist"
+    assert metadata.keys() & {"cameras"} == metadata["learned_from"].keys() & {"cameras"} == set()
+    stored = json.loads((run / "policy.json").read_text())
+    for earlier, names in (("wrist", ("wrist",)), ("", ())):
+        stored["learned_from"].pop("cameras", None)
+        stored["learned_from"]["camera"] = earlier
+        (run / "policy.json").write_text(json.dumps(stored))
+        learned = load_policy_config(run).learned_from
+        assert learned is not None
+        assert learned.cameras == names
+
+
+def test_the_example_sends_the_pictures_of_the_policys_cameras():
+    robot = simulated_robot({**metadata_of(), "cameras": ["wrist", "front"]}, "close_fridge", 0)
+    sent = robot.observe()
+    assert (sent["rgb"].shape, sent["intrinsics"].shape) == ((2, 64, 64, 3), (2, 3, 3))
+    expected = Expected(((64, 64),), (1,), tiny_config().encoding, cameras=("wrist", "front"))
+    assert parse_request({**sent, "prompt": robot.prompt}, expected).points

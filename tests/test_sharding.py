@@ -218,7 +218,7 @@ def test_narrowing_the_frozen_base_changes_nothing():
 
     @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def logits(frozen):
-        inputs = model_inputs(batch.picture, batch.text, experiment.encoding)
+        inputs = model_inputs(batch.pictures, batch.text, experiment.encoding)
         return VLA(experiment.model).apply(join_variables(trainable, frozen), inputs)
 
     np.testing.assert_array_equal(logits(narrow_frozen(frozen, jnp.dtype("bfloat16"))), logits(frozen))

@@ -30,7 +30,7 @@ def start(*shifts: str):
 def test_a_shift_changes_what_is_seen_and_repeats(name):
     plain, shifted, again = start(), start(name), start(name)
     seen = [
-        np.asarray(environment(*([name] * (s is not plain))).observe(s).picture.rgb) for s in (plain, shifted, again)
+        np.asarray(environment(*([name] * (s is not plain))).observe(s).pictures.rgb) for s in (plain, shifted, again)
     ]
     np.testing.assert_array_equal(seen[1], seen[2])
     assert (seen[0] != seen[1]).any(axis=(1, 2, 3)).all()
@@ -42,11 +42,11 @@ def test_other_views_are_calibrated():
     observation = environment("camera").observe(state)
     corner = jnp.array([0.35, 0.3, TABLE_HEIGHT])
     for i in range(EPISODES):
-        camera = jax.tree.map(lambda x, i=i: x[i], observation.picture.camera)
+        camera = jax.tree.map(lambda x, i=i: x[i, 0], observation.pictures.camera)
         (u, v), depth = project(corner, camera)
         assert 0 <= u < 64
-        np.testing.assert_allclose(observation.picture.depth[i, round(float(v)), round(float(u))], depth, atol=0.02)
-    assert len(np.unique(np.asarray(observation.picture.camera.world_from_camera), axis=0)) == EPISODES
+        np.testing.assert_allclose(observation.pictures.depth[i, 0, round(float(v)), round(float(u))], depth, atol=0.02)
+    assert len(np.unique(np.asarray(observation.pictures.camera.world_from_camera), axis=0)) == EPISODES
 
 
 def test_positions_move_each_body_by_a_little():

@@ -218,9 +218,9 @@ def test_reset_is_seeded_settled_and_observable():
     assert not np.any(state.verdict.succeeded)
     assert not np.any(state.ik_failed)
     observation = env.observe(state)
-    assert observation.picture.rgb.shape == (BATCH, 32, 32, 3)
-    assert observation.picture.depth.shape == (BATCH, 32, 32)
-    assert observation.picture.camera.intrinsics.shape == (BATCH, 3, 3)
+    assert observation.pictures.rgb.shape == (BATCH, 1, 32, 32, 3)
+    assert observation.pictures.depth.shape == (BATCH, 1, 32, 32)
+    assert observation.pictures.camera.intrinsics.shape == (BATCH, 1, 3, 3)
     assert observation.robot.pose.shape == (BATCH, 1, 7)
     np.testing.assert_array_equal(observation.robot.gripper_open, 1.0)
     assert env.keypoints(state).shape == (BATCH, 1, 1, 3)
@@ -235,9 +235,9 @@ def test_the_compiled_environment_is_the_pure_functions():
     started = environment.reset(env.scene, env.renderer, env.physics, _keys(), env.variations(_keys()))
     pure = environment.step(env.scene, env.physics, started, action)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), pure, compiled)
-    seen, expected = environment.observe(env.scene, env.renderer, pure), env.observe(compiled)
+    seen, expected = environment.observe(env.scene, env.renderer, env.cameras, pure), env.observe(compiled)
     np.testing.assert_allclose(seen.robot.pose, expected.robot.pose, atol=1e-5)
-    assert np.mean(np.asarray(seen.picture.rgb) != np.asarray(expected.picture.rgb)) < 1e-2
+    assert np.mean(np.asarray(seen.pictures.rgb) != np.asarray(expected.pictures.rgb)) < 1e-2
 
 
 def _carry(env: Environment, state):

@@ -8,24 +8,34 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 
+import eval as evaluation
 from data_pipelines.episodes import EpisodeReader, write_episodes
 from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.evaluation.demo import Options as DemoOptions
+from dsvla_jax.evaluation.demo import main as demo
+from dsvla_jax.evaluation.results import read_results
+from dsvla_jax.experiment import load_experiment
+from dsvla_jax.serving.__main__ import Options as ServingOptions
+from dsvla_jax.serving.__main__ import build_server
+from dsvla_jax.serving.requests import Expected, parse_request
+from examples.robot_client import simulated_robot
 from tests.random_data import random_episode
 from tests.small import SMALL_RUN
 
 ROOT = Path(__file__).parent.parent
 
 
-def start(folder: Path, options: str) -> subprocess.Popen[str]:
+def start(folder: Path, options: str, config: str = SMALL_RUN) -> subprocess.Popen[str]:
     """train.py in a folder, which gets what it says of errors and progress."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
     with (folder / "errors").open("w") as errors:
         return subprocess.Popen(
-            [sys.executable, str(ROOT / "train.py"), *SMALL_RUN.split(), *options.split()],
+            [sys.executable, str(ROOT / "train.py"), *config.split(), *options.split()],
             cwd=folder,
             env=environment,
             stdout=subprocess.PIPE,
@@ -95,3 +105,30 @@ def test_a_run_in_simulation_is_validated_and_evaluated_on_seeds_of_their_own(tm
     assert not pictures & {held_out.episode(number).rgb_png[0] for number in range(2)}
     with contextlib.closing(RunCheckpoints(tmp_path / "run", read_only=True)) as checkpoints:
         assert checkpoints.best_step == 4, "a step that was evaluated comes first"
+
+
+@pytest.mark.slow
+def test_a_policy_of_two_cameras_from_demonstrations_to_evaluation_serving_and_demo(tmp_path: Path):
+    data = "--data.tasks lamp_on --data.episodes 4 --data.image-size 32 --data.keypoints oracle --validation.episodes 2"
+    checks = "--steps 4 --validate-every 4 --evaluate-every 4 --evaluation.episodes-while-training 2"
+    two = " ".join(SMALL_RUN.split()).replace("tiny ", "tiny_two_cameras ", 1)
+    process = start(tmp_path, f"{data} {checks}", two)
+    process.communicate(timeout=900)
+    run = tmp_path / "run"
+    assert process.returncode == 0, (tmp_path / "errors").read_text()
+    assert lines_of(run)[-1]["evaluation/success"] in (0, 0.5, 1)
+    assert EpisodeReader(tmp_path / "data" / "demos_two_cameras").cameras == ("front", "wrist")
+    experiment = load_experiment(run / "config.json")
+    assert (experiment.data.cameras, experiment.model.cameras) == (("front", "wrist"), 2)
+    evaluation.main(evaluation.Options(run, episodes=2))
+    results = read_results(run / "eval")
+    assert len(results) == 2
+    strips = [cv2.imread(str(path)) for path in sorted((run / "eval" / "strips").rglob("*.png"))]
+    assert [strip.shape[0] for strip in strips if strip is not None] == [64, 64]
+    demo(DemoOptions(run))
+    assert (run / "demo.html").is_file()
+    metadata = build_server(ServingOptions(run)).metadata
+    assert metadata["cameras"] == ["front", "wrist"]
+    robot = simulated_robot(metadata, "lamp_on", 0)
+    expected = Expected(((32, 32),), (1,), experiment.encoding, cameras=("front", "wrist"))
+    assert parse_request({**robot.observe(), "prompt": robot.prompt}, expected).points

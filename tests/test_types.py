@@ -51,9 +51,9 @@ def test_pytrees_of_placeholders_pass():
     for placeholders in ([None] * len(leaves), [object()] * len(leaves), [leaf.shape for leaf in leaves]):
         jax.tree.unflatten(structure, placeholders)
     names: Any = jax.tree_util.tree_map_with_path(lambda path, _: jax.tree_util.keystr(path), example)
-    assert names.picture.camera.intrinsics == ".picture.camera.intrinsics"
+    assert names.pictures.camera.intrinsics == ".pictures.camera.intrinsics"
     assert jax.vmap(lambda one: one, in_axes=0)(example).text.tokens.shape == (2, 5)
-    assert jax.tree.structure(example_spec(small_encoding(), 2, 32, 32)) == structure
+    assert jax.tree.structure(example_spec(small_encoding(), 2, 1, 32, 32)) == structure
 
 
 def test_arrays_are_named_by_their_place():

@@ -126,7 +126,7 @@ def test_samples_to_validate_with_are_as_recorded(tmp_path: Path):
         frame = reader.frame(number)
         one, other = (sample(frame, np.random.default_rng(seed)) for seed in (1, 2))
         jax.tree.map(np.testing.assert_array_equal, one, other)
-        np.testing.assert_array_equal(one.example.picture.rgb, frame.picture.rgb)
+        np.testing.assert_array_equal(one.example.pictures.rgb, frame.pictures.rgb)
         bins = encoding.codec.encode(frame.target.pose, frame.target.gripper_open)
         np.testing.assert_array_equal(one.integers[:arms], bins)
         # Its tokens spell each number.

@@ -188,7 +188,7 @@ def test_gate_of_zero_leaves_the_language_model_alone():
     forward = jax.jit(VLA(CONFIG).apply)
     logits = forward(variables, inputs)
     for changed in (
-        dataclasses.replace(inputs, image=inputs.image * 3 + 1),
+        dataclasses.replace(inputs, images=inputs.images * 3 + 1),
         dataclasses.replace(inputs, point_tokens=-inputs.point_tokens),
         dataclasses.replace(inputs, point_patches=3 - inputs.point_patches),
         make_inputs(points=0),
@@ -210,7 +210,7 @@ def test_open_gate_lets_image_and_cloud_through(forward, variables):
     inputs = make_inputs()
     logits = forward(variables, inputs)
     for changed in (
-        dataclasses.replace(inputs, image=inputs.image + 1.0),
+        dataclasses.replace(inputs, images=inputs.images + 1.0),
         dataclasses.replace(inputs, point_tokens=inputs.point_tokens * 2),
         dataclasses.replace(inputs, point_patches=3 - inputs.point_patches),
     ):

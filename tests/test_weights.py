@@ -459,7 +459,7 @@ def test_a_model_runs_from_an_imported_folder(imported):
         jnp.shape, {name: variables["params"][name] for name in backbones}
     )
     inputs = ModelInputs(
-        image=jnp.zeros((1, 15, 15, 3)),
+        images=jnp.zeros((1, 1, 15, 15, 3)),
         point_tokens=jnp.zeros((1, 2, 16)),
         point_patches=jnp.zeros((1, 2), jnp.int32),
         text=Text(jnp.ones((1, 4), jnp.int32), jnp.ones((1, 4), bool)),

@@ -130,7 +130,7 @@ def test_pictures_and_cameras_of_a_folder_are_checked_before_training(tmp_path, 
         value = tuple(encode_image(np.zeros((48, 48, 1), np.uint16), ".png").getvalue() for _ in value)
     else:
         value = value.copy()
-        value[:, :2, 0 if field == "world_from_camera" else 2] *= change
+        value[..., :2, 0 if field == "world_from_camera" else 2] *= change
     write_episodes(tmp_path, [dataclasses.replace(good, **{field: value})])
     with pytest.raises(DataError, match=message):
         look_at_demonstrations(EpisodeReader(tmp_path), DEFAULT)
@@ -189,7 +189,7 @@ def test_depth_without_readings_or_in_other_units_stops_or_is_left_out(tmp_path,
         list(islice(loader, 20))
     loader = make(skip_bad=True)
     for _ in range(20):
-        assert (next(loader).picture.depth > 0).any(axis=(1, 2)).all()
+        assert (next(loader).pictures.depth > 0).any(axis=(1, 2, 3)).all()
     assert len(loader.left_out) == 1
 
 

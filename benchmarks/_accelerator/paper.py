@@ -68,7 +68,7 @@ def paper_experiment(size: Size) -> Experiment:
 def frames(experiment: Experiment, count: int) -> list[Frame]:
     """Frames of one arm that nobody has recorded: random pictures, poses and depths over the table."""
     rng, size = np.random.default_rng(0), experiment.data.image_size
-    camera = jax.tree.map(np.asarray, front_camera(size))
+    camera = jax.tree.map(lambda x: np.asarray(x)[None], front_camera(size))
 
     def pose() -> np.ndarray:
         turn = rng.normal(size=(1, 4))
@@ -78,9 +78,9 @@ def frames(experiment: Experiment, count: int) -> list[Frame]:
 
     return [
         Frame(
-            picture=Picture(
-                rng.integers(0, 256, (size, size, 3), dtype=np.uint8),
-                rng.uniform(0.8, 1.3, (size, size)).astype(np.float32),
+            pictures=Picture(
+                rng.integers(0, 256, (1, size, size, 3), dtype=np.uint8),
+                rng.uniform(0.8, 1.3, (1, size, size)).astype(np.float32),
                 camera,
             ),
             robot=RobotState(pose(), np.ones(1, np.float32)),
@@ -245,7 +245,7 @@ def decode(job: Job) -> None:
             variables, base = {**variables, "params": jax.jit(quantize, donate_argnums=0)(variables["params"])}, "int8"
         policy, robots = TextPolicy(policy_config(experiment, case), variables, tokenizer), case.robots
         asked = frames(experiment, robots)
-        seen = [(Observation(one.picture, one.robot), one.keypoint) for one in asked]
+        seen = [(Observation(one.pictures, one.robot), one.keypoint) for one in asked]
         observation, keypoints = jax.tree.map(lambda *leaves: np.stack(leaves), *seen)
         observation = jax.tree.map(jnp.asarray, observation)
         instructions = [one.instruction for one in asked]

@@ -8,7 +8,7 @@ import numpy as np
 from data_pipelines.records import Frame
 from dsvla_jax.evaluation.pictures import mark_targets
 from dsvla_jax.geometry.cameras import project, unproject
-from dsvla_jax.types import Camera
+from dsvla_jax.types import Picture, split_cameras
 
 CLOUD_SIZE = 320
 _KEYPOINT = (255, 220, 0)
@@ -18,31 +18,36 @@ _TARGET = (255, 0, 200)
 _MARGIN = 0.4
 
 
-def camera_of(frame: Frame) -> Camera:
-    """The camera of a frame."""
-    return jax.tree.map(jnp.asarray, frame.picture.camera)
-
-
 def draw_frame(frame: Frame) -> np.ndarray:
-    """uint8 (H, W, 3): the picture with a ring at each arm's target and a yellow cross at each active keypoint."""
-    picture = mark_targets(frame.picture.rgb, frame.target.pose[:, :3], camera_of(frame))
-    height, width = picture.shape[:2]
+    """The pictures of C cameras one below the other, uint8 (C H, W, 3), see `_draw_picture`."""
+    return np.concatenate([_draw_picture(picture, frame) for picture in split_cameras(frame.pictures)])
+
+
+def _draw_picture(picture: Picture[np.ndarray], frame: Frame) -> np.ndarray:
+    """uint8 (H, W, 3): one picture with a ring at each arm's target and a yellow cross at each active keypoint."""
+    camera = jax.tree.map(jnp.asarray, picture.camera)
+    drawn = mark_targets(picture.rgb, frame.target.pose[:, :3], camera)
+    height, width = drawn.shape[:2]
     if not len(frame.keypoint):
-        return picture
-    pixels, depth = map(np.asarray, project(frame.keypoint, camera_of(frame)))
+        return drawn
+    pixels, depth = map(np.asarray, project(frame.keypoint, camera))
     for (u, v), z in zip(pixels, depth, strict=True):
         if z > 0 and 0 <= u < width and 0 <= v < height:
             place = (round(float(u)), round(float(v)))
             for colour, thickness in (((0, 0, 0), 3), (_KEYPOINT, 1)):
-                cv2.drawMarker(picture, place, colour, cv2.MARKER_CROSS, max(6, height // 12), thickness)
-    return picture
+                cv2.drawMarker(drawn, place, colour, cv2.MARKER_CROSS, max(6, height // 12), thickness)
+    return drawn
 
 
 def frame_cloud(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Every reading as a world point float32 (P, 3), and its colour uint8 (P, 3)."""
-    measured = frame.picture.depth > 0
-    points = np.asarray(unproject(frame.picture.depth, camera_of(frame)))
-    return points[measured], frame.picture.rgb[measured]
+    """Every reading of all cameras as a world point float32 (P, 3), and its colour uint8 (P, 3)."""
+    points, colours = [], []
+    for picture in split_cameras(frame.pictures):
+        measured = picture.depth > 0
+        places = np.asarray(unproject(picture.depth, jax.tree.map(jnp.asarray, picture.camera)))
+        points.append(places[measured])
+        colours.append(picture.rgb[measured])
+    return np.concatenate(points), np.concatenate(colours)
 
 
 def draw_clouds(frame: Frame) -> list[tuple[str, np.ndarray]]:

@@ -4,11 +4,13 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from data_pipelines.episodes import EpisodeReader
 from data_pipelines.first_look import cloud_warnings, frames_of, say_components, say_words
-from data_pipelines.inspect.drawing import camera_of, draw_clouds, draw_frame, frame_cloud
+from data_pipelines.inspect.drawing import draw_clouds, draw_frame, frame_cloud
 from data_pipelines.inspect.page import Page, Section, Table
 from data_pipelines.records import Episode, Frame, decode_frame
 from dsvla_jax.encoding.config import EncodingConfig
@@ -17,6 +19,7 @@ from dsvla_jax.encoding.point_cloud import cloud_from_depth
 from dsvla_jax.encoding.prompts import format_answer
 from dsvla_jax.evaluation.pictures import film_strip
 from dsvla_jax.geometry.rotations import rotation_distance
+from dsvla_jax.types import split_cameras
 
 UNITS = {
     "rgb": "0 to 255",
@@ -49,7 +52,12 @@ def describe_episodes(folder: Path, tasks: Sequence[str] | None, shown: int, enc
     ]
     return Page(
         title=f"{folder}: {len(reader)} episodes, {reader.num_frames} samples",
-        tables=[_features(frames[0]), _counts(by_task), _said(reader, episodes), _statistics(episodes, looks)],
+        tables=[
+            _features(frames[0], reader.cameras),
+            _counts(by_task),
+            _said(reader, episodes),
+            _statistics(episodes, looks),
+        ],
         warnings=[*_warnings(episodes, looks, encoding), *cloud_warnings(frames, encoding)],
         sections=sections,
     )
@@ -67,35 +75,45 @@ class _Look:
 
 
 def _look(frame: Frame, encoding: EncodingConfig) -> _Look:
-    depth = frame.picture.depth
+    depth = frame.pictures.depth
     readings = depth[depth > 0]
-    _, valid = cloud_from_depth(
-        depth, camera_of(frame), encoding.workspace_low, encoding.workspace_high, encoding.stride
-    )
+    box = (encoding.workspace_low, encoding.workspace_high)
+    clouds = [
+        cloud_from_depth(one.depth, jax.tree.map(jnp.asarray, one.camera), *box, encoding.stride)
+        for one in split_cameras(frame.pictures)
+    ]
     points, _ = frame_cloud(frame)
     distances = [np.linalg.norm(points - point, axis=1).min() for point in frame.keypoint] if len(points) else []
     return _Look(
         missing=1 - len(readings) / depth.size,
         nearest=float(readings.min()) if len(readings) else float("nan"),
         farthest=float(readings.max()) if len(readings) else float("nan"),
-        in_workspace=int(np.sum(valid)),
+        in_workspace=sum(int(np.sum(valid)) for _, valid in clouds),
         keypoint_distance=np.array(distances),
     )
 
 
-def _features(frame: Frame) -> Table:
-    arrays = {
-        "rgb": frame.picture.rgb,
-        "depth": frame.picture.depth,
-        "intrinsics": frame.picture.camera.intrinsics,
-        "world_from_camera": frame.picture.camera.world_from_camera,
+def _features(frame: Frame, cameras: Sequence[str]) -> Table:
+    arrays = {}
+    for number, one in enumerate(split_cameras(frame.pictures)):
+        of = f" of {cameras[number]}" if len(cameras) > 1 else ""
+        arrays |= {
+            f"rgb{of}": one.rgb,
+            f"depth{of}": one.depth,
+            f"intrinsics{of}": one.camera.intrinsics,
+            f"world_from_camera{of}": one.camera.world_from_camera,
+        }
+    arrays |= {
         "pose": frame.robot.pose,
         "gripper_open": frame.robot.gripper_open,
         "keypoint": frame.keypoint,
         "target_pose": frame.target.pose,
         "target_gripper": frame.target.gripper_open,
     }
-    rows = [(name, str(value.dtype), " x ".join(map(str, value.shape)), UNITS[name]) for name, value in arrays.items()]
+    rows = [
+        (name, str(value.dtype), " x ".join(map(str, value.shape)), UNITS[name.split()[0]])
+        for name, value in arrays.items()
+    ]
     rows += [("instruction", "text", "", repr(frame.instruction)), ("task", "text", "", repr(frame.task))]
     return Table("features of a sample", ("feature", "type", "shape", "unit"), rows, numbers=False)
 

@@ -31,7 +31,7 @@ from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import displace
 from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.evaluation.pictures import MAX_STRIP_FRAMES, film_strip
-from dsvla_jax.types import Action, Picture, RobotState
+from dsvla_jax.types import Action, Picture, RobotState, join_cameras
 
 _VERSION = re.compile(r"\d+\.\d+\.\d+")
 LOOKED_AT = 200
@@ -157,7 +157,7 @@ def _section(opened: OpenDataset, number: int, encoding: EncodingConfig, scale: 
     samples = opened.read(number)
     chosen = np.unique(np.linspace(0, len(samples) - 1, MAX_STRIP_FRAMES).round().astype(int)).tolist()
     frames = [_frame(samples[i], i, opened.config) for i in chosen]
-    pictures = [frame.picture.rgb if samples[0].camera is None else draw_frame(frame) for frame in frames]
+    pictures = [frame.pictures.rgb[0] if samples[0].camera is None else draw_frame(frame) for frame in frames]
     caption = f"{len(chosen)} of {len(samples)} samples, cut and coloured as training may see them"
     if samples[0].camera is not None:
         caption += "; rings: where to go next"
@@ -180,7 +180,7 @@ def _frame(sample: EncodedSample, number: int, config: OxeConfig) -> Frame:
         assert sample.displacement is not None
         target = displace(sample.pose, sample.displacement)
     return Frame(
-        picture=Picture(rgb, depth, camera),
+        pictures=join_cameras([Picture(rgb, depth, camera)]),
         robot=RobotState(sample.pose, sample.gripper_open),
         keypoint=np.zeros((0, 3), np.float32),
         target=Action(target, sample.target_gripper),

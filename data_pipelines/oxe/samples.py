@@ -1,7 +1,7 @@
 """From encoded frames to a batch of examples.
 
 The prompt is the one of simulated demonstrations without the keypoint sentence. Where there is no calibrated depth,
-`depth` is one missing pixel and the camera zeros: a policy without 3D tokens reads neither.
+`depth` is one missing pixel and the camera zeros: a policy without 3D tokens reads neither. Examples have one camera.
 """
 
 from collections.abc import Callable, Sequence
@@ -67,7 +67,8 @@ def make_batcher(
             rgb = rgb[chosen]
         rows = [(views[row], texts[row]) for row in chosen]
         (depth, camera), (text, answer_mask, number_rows) = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-        return Example(Picture(rgb, depth, camera), text, answer_mask, number_rows)
+        pictures = jax.tree.map(lambda x: x[:, None], Picture(rgb, depth, camera))
+        return Example(pictures, text, answer_mask, number_rows)
 
     return batch
 

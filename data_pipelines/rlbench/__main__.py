@@ -8,7 +8,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -39,8 +39,8 @@ EPISODES_PER_SHARD = 20
 class Settings:
     """What decides the contents of an imported folder, besides its source."""
 
-    camera: str = "front"
-    """The camera to learn from."""
+    cameras: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--camera",))] = ("front",)
+    """The cameras to learn from, in this order."""
     every_n: int = 10
     """Every how many observations a further sample starts, on the way to the next keyframe; 0: keyframes only."""
     keypoints: Literal["contacts", "none"] = "contacts"
@@ -52,8 +52,15 @@ class Settings:
     """Observations after a stop in which no further stop counts."""
 
     def __post_init__(self) -> None:
-        require(bool(self.camera), "camera", "a name", repr(self.camera))
+        distinct = len(set(self.cameras)) == len(self.cameras) and all(self.cameras)
+        require(bool(self.cameras) and distinct, "cameras", "different names", self.cameras)
         check_fields(self, "", **self._ranges())
+
+    def as_written(self) -> dict[str, Any]:
+        """The settings that an index keeps: a single camera as `camera`, several as `cameras`."""
+        fields = dataclasses.asdict(self)
+        first, *others = fields.pop("cameras")
+        return {"cameras": [first, *others], **fields} if others else {"camera": first, **fields}
 
     def _ranges(self) -> dict[str, Range]:
         return {"every_n": at_least(0), "still": at_least(0), "stop_buffer": at_least(0)}
@@ -92,7 +99,7 @@ def contact_keypoints(pose: np.ndarray, gripper_open: np.ndarray) -> np.ndarray:
 
 def import_episode(folder: Path, task: str, number: int, settings: Settings) -> tuple[Episode, bool]:
     """One episode folder, and whether its joints ever rest. Raises DataError where it is damaged."""
-    recording, joint_velocities = read_recording(folder, task, settings.camera, keyframes_only=settings.every_n == 0)
+    recording, joint_velocities = read_recording(folder, task, settings.cameras, keyframes_only=settings.every_n == 0)
     check_velocities(joint_velocities, folder)
     if settings.keypoints == "contacts":
         points = contact_keypoints(recording.pose, recording.gripper_open)
@@ -154,7 +161,7 @@ def _import_missing(
     chosen: dict[str, list[Path]], out: Path, settings: Settings, episodes: int | None, skip_bad: bool, progress: bool
 ) -> list[dict[str, str]]:
     """Writes the shards that `out` lacks of the episode folders of each task; returns what was left out."""
-    wanted = {"importer": "rlbench", **dataclasses.asdict(settings)}
+    wanted = {"importer": "rlbench", **settings.as_written()}
     # Folders from before these could be chosen.
     assumed = {"still": STILL, "stop_buffer": STOP_BUFFER}
     entries = {entry["file"]: entry for entry in existing_shards(out, wanted, assumed)}
@@ -183,7 +190,7 @@ def _import_missing(
                         episode, rests = import_episode(folder, task, number, settings)
                         good.append(episode)
                         restless += not rests
-                        aside.update(left_aside(folder, settings.camera))
+                        aside.update(left_aside(folder, settings.cameras))
                     except DataError as error:
                         if not skip_bad:
                             raise

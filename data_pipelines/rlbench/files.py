@@ -19,7 +19,7 @@ from typing import SupportsIndex, cast
 import cv2
 import numpy as np
 
-from data_pipelines.recording import Recording
+from data_pipelines.recording import CameraRecording, Recording
 from data_pipelines.records import mark_missing
 from data_pipelines.rlbench.unpickle import Node, read_pickle, to_array
 from dsvla_jax.errors import DataError
@@ -67,9 +67,9 @@ def _episode_number(path: Path) -> tuple[str, list[tuple[int, str]]]:
 
 
 def read_recording(
-    folder: Path, task: str, camera: str = "front", keyframes_only: bool = False
+    folder: Path, task: str, cameras: Sequence[str] = ("front",), keyframes_only: bool = False
 ) -> tuple[Recording, np.ndarray]:
-    """An episode's recording and its joint velocities (T, A, 7). Pictures are read when asked for.
+    """An episode's recording by some cameras, and its joint velocities (T, A, 7). Pictures are read when asked for.
 
     The instruction is the first of the descriptions, as in PerAct. The recording has no keypoints: RLBench keeps none.
     keyframes_only: for copies that kept the pictures of keyframes only; the others are missed when asked for.
@@ -90,23 +90,36 @@ def read_recording(
         rows = [[_numbers(arm, field, shape, i, path) for arm in row] for i, row in enumerate(arms)]
         return np.array(rows)
 
-    def seen(field: str, shape: tuple[int, ...]) -> np.ndarray:
+    def seen(camera: str, field: str, shape: tuple[int, ...]) -> np.ndarray:
         name = f"{camera}_camera_{field}"
         return np.array(
             [_numbers(_field(item, "misc", i, path), name, shape, i, path) for i, item in enumerate(observations)]
         )
 
-    _check_camera_name(camera, _field(observations[0], "misc", 0, path), path)
     count = len(observations)
-    near, far = seen("near", ()), seen("far", ())
-    intrinsics = seen("intrinsics", (3, 3))
+
+    def recorded(camera: str) -> CameraRecording:
+        _check_camera_name(camera, _field(observations[0], "misc", 0, path), path)
+        near, far = seen(camera, "near", ()), seen(camera, "far", ())
+        intrinsics = seen(camera, "intrinsics", (3, 3))
+        return CameraRecording(
+            rgb=_Pictures(folder, f"{camera}_rgb", count, keyframes_only),
+            depth=_DepthMaps(folder, f"{camera}_depth", count, keyframes_only, near, far),
+            intrinsics=intrinsics,
+            world_from_camera=seen(camera, "extrinsics", (4, 4)),
+        )
+
+    name, *others = cameras
+    first = recorded(name)
     recording = Recording(
         task=task,
         instruction=_instruction(folder),
-        rgb=_Pictures(folder, f"{camera}_rgb", count, keyframes_only),
-        depth=_DepthMaps(folder, f"{camera}_depth", count, keyframes_only, near, far),
-        intrinsics=intrinsics,
-        world_from_camera=seen("extrinsics", (4, 4)),
+        rgb=first.rgb,
+        depth=first.depth,
+        intrinsics=first.intrinsics,
+        world_from_camera=first.world_from_camera,
+        camera=name,
+        other_cameras={other: recorded(other) for other in others},
         pose=felt("gripper_pose", (7,)),
         gripper_open=felt("gripper_open", ()),
         variation=_variation(folder),
@@ -114,10 +127,10 @@ def read_recording(
     return recording, felt("joint_velocities", (7,))
 
 
-def left_aside(folder: Path, camera: str) -> list[str]:
+def left_aside(folder: Path, cameras: Sequence[str]) -> list[str]:
     """The folders of an episode that are not read: masks, point clouds and other cameras."""
     kinds = {path.name for path in folder.iterdir() if path.is_dir()}
-    return sorted(kinds - {f"{camera}_rgb", f"{camera}_depth"})
+    return sorted(kinds - {f"{camera}_{kind}" for camera in cameras for kind in ("rgb", "depth")})
 
 
 def _check_camera_name(camera: str, misc: object, path: Path) -> None:

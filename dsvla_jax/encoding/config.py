@@ -56,13 +56,6 @@ class EncodingConfig:
         require_box("encoding.workspace_low", self.workspace_low, "workspace_high", self.workspace_high)
         patches = f"a multiple of patch_size {self.patch_size}"
         require(self.image_size % self.patch_size == 0, "encoding.image_size", patches, self.image_size)
-        if self.use_points and self.alignment == "index_order":
-            require(
-                self.num_point_tokens <= self.grid**2,
-                "encoding.points.group_sizes",
-                f"at most {self.grid**2} tokens at the end with alignment index_order, one a patch",
-                self.num_point_tokens,
-            )
         self._require_writable_positions()
 
     def _require_writable_positions(self) -> None:
@@ -78,13 +71,27 @@ class EncodingConfig:
             f"use fewer bins than {self.codec.bins}, or a larger box than {self.codec.low} to {self.codec.high}",
         )
 
-    def require_points(self, height: int, width: int, picture: str = "a depth map") -> None:
-        """Raises UserError if a depth map has fewer points than the 3D tokenizer takes. picture: what to call it."""
-        count = -(-height // self.stride) * -(-width // self.stride)
+    def require_patches(self, cameras: int) -> None:
+        """Raises UserError if alignment index_order has fewer patches of so many cameras than 3D tokens."""
+        patches = cameras * self.grid**2
+        require(
+            not self.use_points or self.alignment != "index_order" or self.num_point_tokens <= patches,
+            "encoding.points.group_sizes",
+            f"at most {patches} tokens at the end with alignment index_order, one a patch",
+            self.num_point_tokens,
+        )
+
+    def require_points(self, height: int, width: int, cameras: int, picture: str = "a depth map") -> None:
+        """Raises UserError if the cameras' depth maps have fewer points than the 3D tokenizer takes.
+
+        picture: what to call one of them.
+        """
+        count = cameras * -(-height // self.stride) * -(-width // self.stride)
+        each = picture if cameras == 1 else f"{cameras} pictures, each {picture}"
         require(
             not self.use_points or count >= self.points.num_points,
             "encoding.points.num_points",
-            f"at most the {count} points of {picture} of {height} x {width} pixels with encoding.stride {self.stride}",
+            f"at most the {count} points of {each} of {height} x {width} pixels with encoding.stride {self.stride}",
             self.points.num_points,
             "lower num_points or stride, or use larger pictures",
         )

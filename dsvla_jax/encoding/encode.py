@@ -1,4 +1,4 @@
-"""The one path from a picture and words to the network's inputs."""
+"""The one path from pictures and words to the network's inputs."""
 
 import jax
 import jax.numpy as jnp
@@ -22,42 +22,57 @@ CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
-def model_inputs(picture: Picture[Array], text: Text[Array], config: EncodingConfig) -> ModelInputs[Array]:
-    """Encodes a batch of pictures and texts for the network. Pictures may have any size; their cameras describe it."""
-    image = normalize_image(picture.rgb, config.image_size)
+def model_inputs(pictures: Picture[Array], text: Text[Array], config: EncodingConfig) -> ModelInputs[Array]:
+    """Encodes a batch of pictures and texts for the network. Pictures may have any size; their cameras describe it.
+
+    pictures: rgb (B, C, H, W, 3), and so on.
+    """
+    batch, cameras = pictures.rgb.shape[:2]
+    images = normalize_image(pictures.rgb.reshape(-1, *pictures.rgb.shape[2:]), config.image_size)
     if config.use_points:
-        tokens, _, patches = cloud_tokens(picture, config)
+        tokens, _, patches = cloud_tokens(pictures, config)
     else:
-        tokens = jnp.zeros((len(image), 0, config.points.width), jnp.float32)
-        patches = jnp.zeros((len(image), 0), jnp.int32)
-    return ModelInputs(image, tokens, patches, text)
+        tokens = jnp.zeros((batch, 0, config.points.width), jnp.float32)
+        patches = jnp.zeros((batch, 0), jnp.int32)
+    return ModelInputs(images.reshape(batch, cameras, *images.shape[1:]), tokens, patches, text)
 
 
 def cloud_tokens(
-    picture: Picture[Array], config: EncodingConfig
+    pictures: Picture[Array], config: EncodingConfig
 ) -> tuple[Float[Array, "b g d"], Float[Array, "b g 3"], Int[Array, "b g"]]:
-    """Makes the 3D tokens of a batch.
+    """Makes the 3D tokens of a batch, of the joint cloud of all its cameras.
 
-    Returns the tokens, their centres (metres, world frame), and the image patches that they are aligned with.
+    Returns the tokens, their centres (metres, world frame), and the image patches that they are aligned with: each
+    with a patch of the camera that its centre comes from.
     """
-    height, width = picture.depth.shape[1:]
-    config.require_points(height, width)
+    batch, cameras, height, width = pictures.depth.shape
+    config.require_points(height, width, cameras)
     cloud = jax.vmap(
         lambda depth, camera: cloud_from_depth(
             depth, camera, config.workspace_low, config.workspace_high, config.stride
         )
     )
-    points, valid = cloud(picture.depth, picture.camera)
+    each = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (pictures.depth, pictures.camera))
+    points, valid = cloud(*each)
+    of_a_camera = points.shape[1]
+    points, valid = points.reshape(batch, -1, 3), valid.reshape(batch, -1)
     chosen = farthest_point_sample(points, valid, config.points.num_points)
     points = jnp.take_along_axis(points, chosen[..., None], axis=1)
     tokens, centers = jax.vmap(lambda one: tokenize_points(one, config.points))(points)
-    patches = jax.vmap(lambda one, camera: align_to_patches(one, camera, height, width, config.grid, config.alignment))(
-        centers, picture.camera
+    # A token's centre is one of the points: the first ones, see `tokenize_points`.
+    seen_by = chosen[:, : config.points.num_tokens] // of_a_camera
+    align = jax.vmap(
+        lambda centers, seen_by, cameras: align_to_patches(
+            centers, seen_by, cameras, height, width, config.grid, config.alignment
+        )
     )
+    patches = align(centers, seen_by, pictures.camera)
     return tokens, centers, patches
 
 
-def example_spec(config: EncodingConfig, batch: int, height: int, width: int) -> Example[jax.ShapeDtypeStruct]:
+def example_spec(
+    config: EncodingConfig, batch: int, cameras: int, height: int, width: int
+) -> Example[jax.ShapeDtypeStruct]:
     """The shapes and dtypes of a batch of examples with pictures of (height, width)."""
 
     def spec(dtype: DTypeLike, *shape: int) -> jax.ShapeDtypeStruct:
@@ -66,9 +81,9 @@ def example_spec(config: EncodingConfig, batch: int, height: int, width: int) ->
     length = config.max_text_length
     return Example(
         Picture(
-            spec(jnp.uint8, height, width, 3),
-            spec(jnp.float32, height, width),
-            Camera(spec(jnp.float32, 3, 3), spec(jnp.float32, 4, 4)),
+            spec(jnp.uint8, cameras, height, width, 3),
+            spec(jnp.float32, cameras, height, width),
+            Camera(spec(jnp.float32, cameras, 3, 3), spec(jnp.float32, cameras, 4, 4)),
         ),
         Text(spec(jnp.int32, length), spec(jnp.bool_, length)),
         answer_mask=spec(jnp.bool_, length),

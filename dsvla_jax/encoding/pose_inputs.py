@@ -28,7 +28,7 @@ def with_two_arms(array: AnyArray, axis: int) -> AnyArray:
 
 
 def pose_inputs(
-    picture: Picture[AnyArray],
+    pictures: Picture[AnyArray],
     robot: RobotState[AnyArray],
     words: Text[AnyArray],
     keypoints: Float[AnyArray, "*b a 3"] | None,
@@ -46,7 +46,7 @@ def pose_inputs(
     if keypoints is not None:
         near = with_two_arms(keypoints, axis)
     has_keypoints: AnyArray = library.full(tuple(batch), keypoints is not None)
-    return PoseInputs(picture, state, there, words, near, has_keypoints)
+    return PoseInputs(pictures, state, there, words, near, has_keypoints)
 
 
 def encode_instruction(tokenizer: Tokenizer, instruction: str, length: int) -> Text[np.ndarray]:
@@ -62,20 +62,20 @@ def encode_instruction(tokenizer: Tokenizer, instruction: str, length: int) -> T
 
 
 def pose_example_spec(
-    batch: int, height: int, width: int, words: int, upcoming: int
+    batch: int, cameras: int, height: int, width: int, words: int, upcoming: int
 ) -> PoseExample[jax.ShapeDtypeStruct]:
     """The shapes and dtypes of a batch of examples with pictures of (height, width)."""
 
     def spec(dtype: DTypeLike, *shape: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((batch, *shape), dtype)
 
-    picture = Picture(
-        spec(jnp.uint8, height, width, 3),
-        spec(jnp.float32, height, width),
-        Camera(spec(jnp.float32, 3, 3), spec(jnp.float32, 4, 4)),
+    pictures = Picture(
+        spec(jnp.uint8, cameras, height, width, 3),
+        spec(jnp.float32, cameras, height, width),
+        Camera(spec(jnp.float32, cameras, 3, 3), spec(jnp.float32, cameras, 4, 4)),
     )
     inputs = PoseInputs(
-        picture,
+        pictures,
         RobotState(spec(jnp.float32, ARMS, 7), spec(jnp.float32, ARMS)),
         spec(jnp.bool_, ARMS),
         Text(spec(jnp.int32, words), spec(jnp.bool_, words)),

@@ -1,6 +1,6 @@
 """Show one episode of a run as an HTML page: python -m dsvla_jax.evaluation.demo RUN [--task lamp_on] [--out demo.html]
 
-For each keyframe: the picture with the cloud's 3D tokens and the patches they are aligned with, the keypoints, the
+For each keyframe: the pictures with the cloud's 3D tokens and the patches they are aligned with, the keypoints, the
 prompt, the answer with how probable each number was, and where the arm went.
 """
 
@@ -31,7 +31,7 @@ from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
-from dsvla_jax.types import Action, Observation
+from dsvla_jax.types import Action, Observation, split_cameras
 
 SHOWN = 480  # pixels a side of a picture on the page
 NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
@@ -79,6 +79,8 @@ def draw_tokens(rgb: np.ndarray, centers: np.ndarray, patches: np.ndarray, camer
         row, column = divmod(int(patch), grid)
         corners = [(round(x * cell), round(y * cell)) for x, y in ((column, row), (column + 1, row + 1))]
         cv2.rectangle(picture, corners[0], corners[1], (255, 255, 255), 1)
+    if not len(depth):
+        return picture
     near = (depth.max() - depth) / max(float(np.ptp(depth)), 1e-6)
     for place, patch, closeness in zip(places, patches, near, strict=True):
         row, column = divmod(int(patch), grid)
@@ -91,35 +93,47 @@ def draw_tokens(rgb: np.ndarray, centers: np.ndarray, patches: np.ndarray, camer
 
 
 def draw_keypoints(picture: np.ndarray, keypoints: np.ndarray, camera, image_size: tuple[int, int]) -> np.ndarray:
-    """Crosses, enlarged likewise, at points (N, 3)."""
-    pixels, _ = project(jnp.asarray(keypoints), camera)
+    """Crosses, enlarged likewise, at points (N, 3) before the camera."""
+    pixels, depth = map(np.asarray, project(jnp.asarray(keypoints), camera))
     picture = picture.copy()
-    for place in (np.asarray(pixels) + 0.5) * [SHOWN / image_size[1], SHOWN / image_size[0]]:
+    for place in (pixels[depth > 0] + 0.5) * [SHOWN / image_size[1], SHOWN / image_size[0]]:
         point = (round(float(place[0])), round(float(place[1])))
         for colour, thickness in (((0, 0, 0), 4), ((60, 255, 60), 2)):
             cv2.drawMarker(picture, point, colour, cv2.MARKER_TILTED_CROSS, 18, thickness, cv2.LINE_AA)
     return picture
 
 
+def film_picture(rgb: np.ndarray) -> np.ndarray:
+    """The pictures uint8 (C, H, W, 3) of one moment one below the other, all 192 pixels a side."""
+    return np.concatenate([cv2.resize(frame, (192, 192), interpolation=cv2.INTER_NEAREST) for frame in rgb])
+
+
 def describe(policy: Policy, seen: Observation, instruction: str, near: np.ndarray, decision: Decision) -> Step:
     """One turn of the only robot of a batch. near: the active keypoint of each arm, (A, 3)."""
     encoding: EncodingConfig = policy.config.encoding
     one = jax.tree.map(lambda x: np.asarray(x)[0], seen)
-    rgb, camera, size = one.picture.rgb, one.picture.camera, one.picture.rgb.shape[:2]
-    picture = enlarged = cv2.resize(rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST)
-    if encoding.use_points:
-        tokens = jax.jit(cloud_tokens, static_argnums=1)(seen.picture, encoding)
-        centers, patches = (np.asarray(x)[0] for x in tokens[1:])
-        picture = draw_tokens(rgb, centers, patches, camera, encoding.grid)
     target = np.asarray(decision.action.pose)[0]
-    scale = np.diag([SHOWN / size[1], SHOWN / size[0], 1.0]).astype(np.float32)
-    marked = mark_targets(enlarged, target[:, :3], dataclasses.replace(camera, intrinsics=scale @ camera.intrinsics))
+    centers, patches = np.zeros((0, 3), np.float32), np.zeros(0, int)
+    if encoding.use_points:
+        tokens = jax.jit(cloud_tokens, static_argnums=1)(seen.pictures, encoding)
+        centers, patches = (np.asarray(x)[0] for x in tokens[1:])
+    of_camera, patch = np.divmod(patches, encoding.grid**2)
+    with_tokens, with_target = [], []
+    for number, picture in enumerate(split_cameras(one.pictures)):
+        rgb, camera, size = picture.rgb, picture.camera, picture.rgb.shape[:2]
+        mine = of_camera == number
+        with_tokens.append(draw_tokens(rgb, centers[mine], patch[mine], camera, encoding.grid))
+        enlarged = cv2.resize(rgb, (SHOWN, SHOWN), interpolation=cv2.INTER_NEAREST)
+        scale = np.diag([SHOWN / size[1], SHOWN / size[0], 1.0]).astype(np.float32)
+        scaled = dataclasses.replace(camera, intrinsics=scale @ camera.intrinsics)
+        marked = mark_targets(enlarged, target[:, :3], scaled)
+        with_target.append(draw_keypoints(marked, near, camera, size) if encoding.use_keypoints else marked)
     # Poses come without probabilities.
     sure = np.ones((len(target), len(NUMBERS))) if decision.log_probs is None else np.exp(decision.log_probs[0])
     bins = parse_answer(decision.texts[0], len(target), encoding.style)
     return Step(
-        tokens=png_data(picture),
-        target=png_data(draw_keypoints(marked, near, camera, size) if encoding.use_keypoints else marked),
+        tokens=png_data(np.concatenate(with_tokens, axis=1)),
+        target=png_data(np.concatenate(with_target, axis=1)),
         prompt=instruction if policy.config.baseline else build_prompt(encoding, instruction, one.robot, near),
         answer=decision.texts[0],
         numbers=[
@@ -139,7 +153,8 @@ def main(options: Options) -> None:
         raise UserError(f"--task: expected one task, got {options.task!r}; the first of its tasks is {task}")
     out = options.out or options.run / "demo.html"
     require_writable(out.parent)
-    policy, environment = dsvla_jax.policy.load_policy(options.run), Environment(task, image_size=data.image_size)
+    policy = dsvla_jax.policy.load_policy(options.run)
+    environment = Environment(task, image_size=data.image_size, cameras=data.cameras)
     print(f"{task}, episode {options.seed}: compiling takes a minute the first time", flush=True)
     state = environment.reset(episode_keys(0, "eval", task, options.seed, 1))
     steps: list[Step] = []
@@ -160,7 +175,7 @@ def main(options: Options) -> None:
         seed=options.seed,
         ending=ending,
         steps=steps,
-        film=[png_data(cv2.resize(frame, (192, 192), interpolation=cv2.INTER_NEAREST)) for frame in ending.frames],
+        film=[png_data(film_picture(view.rgb)) for view in ending.views],
     )
     print(f"{'success' if ending.success else ending.reason}: {out}")
 

@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Float, Int
 
 from dsvla_jax.evaluation.loop import KeypointSource, policy_step
-from dsvla_jax.evaluation.outcome import EpisodeOutcome, camera_of, failure_reasons, is_over
+from dsvla_jax.evaluation.outcome import EpisodeOutcome, failure_reasons, is_over, views_of
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.policies.interface import DevicePolicy, Policy
 from dsvla_jax.sim import environment as simulator
@@ -152,7 +152,7 @@ class DeviceLoop:
         rollout = self._ask(state, instructions, keypoints)
         targets, keyframes = np.asarray(rollout.targets), np.asarray(rollout.keyframes)
         texts = [self._policy.texts(answers) for answers in self._answers(rollout, int(keyframes.max()))]
-        last = np.asarray(environment.observe(rollout.state).picture.rgb)
+        last = views_of(environment.observe(rollout.state))
         reasons = failure_reasons(environment, rollout.state)
         on_keyframe(int(keyframes.max()), int(np.sum(environment.success(rollout.state))))
         outcomes = []
@@ -165,8 +165,7 @@ class DeviceLoop:
                     keyframes=done,
                     instruction=instructions[i],
                     answers=[texts[k][i] for k in range(done)],
-                    frames=[last[i]],
-                    camera=camera_of(rollout.state, i),
+                    views=[last[i]],
                     targets=[targets[k, i] for k in range(done)],
                 )
             )

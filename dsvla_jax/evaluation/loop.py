@@ -16,7 +16,7 @@ from tqdm import tqdm
 from dsvla_jax.compile_times import first_use
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.errors import UserError
-from dsvla_jax.evaluation.outcome import EpisodeOutcome, camera_of, failure_reasons, is_over
+from dsvla_jax.evaluation.outcome import EpisodeOutcome, View, failure_reasons, is_over, views_of
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
@@ -159,7 +159,7 @@ def run_episodes(
     noise = np.broadcast_to(noise, own.shape)
     latched: np.ndarray | Array = np.zeros(own.shape[:2], np.int32)
     problems = no_problem
-    seen: list[list[np.ndarray]] = [[] for _ in range(batch)]
+    seen: list[list[View]] = [[] for _ in range(batch)]
     answers: list[list[str]] = [[] for _ in range(batch)]
     targets: list[list[np.ndarray]] = [[] for _ in range(batch)]
     over = np.array(is_over(state))
@@ -176,14 +176,14 @@ def run_episodes(
         problems = [old or new for old, new in zip(problems, missing, strict=True)]
         over |= np.array([bool(problem) for problem in problems])
         state, latched, action, texts = policy_step(state, observation, latched, keypoints, decide, environment.step)
-        rgb, positions = np.asarray(observation.picture.rgb), np.asarray(action.pose)[..., :3]
+        views, positions = views_of(observation), np.asarray(action.pose)[..., :3]
         for i in np.flatnonzero(~over).tolist():
-            seen[i].append(rgb[i])
+            seen[i].append(views[i])
             answers[i].append(texts[i])
             targets[i].append(positions[i])
         over |= np.asarray(is_over(state))
         on_keyframe(done, int(np.sum(environment.success(state))))
-    last, reasons = np.asarray(environment.observe(state).picture.rgb), failure_reasons(environment, state)
+    last, reasons = views_of(environment.observe(state)), failure_reasons(environment, state)
     reasons = [problem or reason for problem, reason in zip(problems, reasons, strict=True)]
     return [
         EpisodeOutcome(
@@ -192,8 +192,7 @@ def run_episodes(
             keyframes=len(seen[i]),
             instruction=instructions[i],
             answers=answers[i],
-            frames=[*seen[i], last[i]],
-            camera=camera_of(state, i),
+            views=[*seen[i], last[i]],
             targets=targets[i],
         )
         for i in range(batch)

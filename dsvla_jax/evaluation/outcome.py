@@ -4,10 +4,20 @@ import dataclasses
 
 import jax
 import numpy as np
+from jaxtyping import UInt8
 
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
-from dsvla_jax.types import Array, Camera
+from dsvla_jax.types import Array, Camera, Observation
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """What the C cameras of one episode saw at one moment."""
+
+    rgb: UInt8[np.ndarray, "c h w 3"]
+    camera: Camera[np.ndarray]
+    """Stacked: intrinsics (C, 3, 3), world_from_camera (C, 4, 4)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,13 +32,16 @@ class EpisodeOutcome:
     instruction: str
     answers: list[str]
     """The policy's answer text for each keyframe."""
-    frames: list[np.ndarray]
-    """uint8 (H, W, 3): what the policy saw before each keyframe, and the last view. Of the loop on the device, the last
-    view alone."""
-    camera: Camera
-    """The camera of the frames."""
+    views: list[View]
+    """What the policy saw before each keyframe, and the last view. Of the loop on the device, the last view alone."""
     targets: list[np.ndarray]
-    """float32 (A, 3): the position answered to each frame but the last."""
+    """float32 (A, 3): the position answered to each view but the last."""
+
+
+def views_of(observation: Observation) -> list[View]:
+    """Returns what was seen of each of the B episodes."""
+    rgb, camera = jax.tree.map(np.asarray, (observation.pictures.rgb, observation.pictures.camera))
+    return [View(rgb[i], jax.tree.map(lambda x, i=i: x[i], camera)) for i in range(len(rgb))]
 
 
 def is_over(state: SimState) -> Array:
@@ -51,8 +64,3 @@ def failure_reasons(environment: Environment, state: SimState) -> list[str]:
         "" if succeeded[i] else next((reason for reason, check in found.items() if check[i]), "time-out")
         for i in range(len(succeeded))
     ]
-
-
-def camera_of(state: SimState, episode: int) -> Camera:
-    """Returns the camera of one of the B episodes."""
-    return jax.tree.map(lambda x: x[episode], state.camera)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,6 +39,17 @@ def mark_targets(frame: np.ndarray, positions: ArrayLike, camera: Camera) -> np.
         if inside:
             cv2.circle(picture, centre, int(0.15 * radius * 2**fraction), colour, -1, cv2.LINE_AA, fraction)
     return picture
+
+
+def mark_view(rgb: np.ndarray, positions: ArrayLike | None, cameras: Camera) -> np.ndarray:
+    """The pictures of C cameras one below the other, uint8 (C H, W, 3), with `mark_targets` in each.
+
+    rgb: uint8 (C, H, W, 3). positions: None for no targets. cameras: stacked, C of them.
+    """
+    if positions is None:
+        return np.concatenate(list(rgb))
+    one = [jax.tree.map(lambda x, c=c: x[c], cameras) for c in range(len(rgb))]
+    return np.concatenate([mark_targets(frame, positions, camera) for frame, camera in zip(rgb, one, strict=True)])
 
 
 def film_strip(frames: Sequence[np.ndarray], max_frames: int = MAX_STRIP_FRAMES) -> np.ndarray:

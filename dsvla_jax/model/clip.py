@@ -1,8 +1,9 @@
 """CLIP's vision transformer over 2D patches and 3D tokens in one sequence.
 
-Radford et al. 2021 (the architecture of openai/CLIP's ViT). The sequence is [CLS | 2D patches | 3D tokens]; a 3D token
-carries the positional embedding of the patch that its centre projects onto (2D-to-3D positional alignment), so the
-pretrained encoder needs no new parameters for it.
+Radford et al. 2021 (the architecture of openai/CLIP's ViT). The sequence is [CLS | 2D patches | 3D tokens], the patches
+camera by camera; a 3D token carries the positional embedding of the patch that its centre projects onto (2D-to-3D
+positional alignment), so the pretrained encoder needs no new parameters for it. All cameras share one table of
+positions; one learned embedding for each of several cameras tells them apart.
 """
 
 import flax.linen as nn
@@ -14,6 +15,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.layers import KERNEL_INIT, layer_norm, over_layers, residual_init
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
+from dsvla_jax.model.variables import CAMERA_EMBEDDING
 from dsvla_jax.types import Array
 
 
@@ -54,21 +56,24 @@ class VisionBlock(nn.Module):
 
 
 class VisionTower(nn.Module):
-    """image float32 (B, S, S, 3), point_tokens (B, G, D), point_patches int32 (B, G) -> (B, 1 + N + G, output width).
+    """Images, 3D tokens and their patches -> (B, 1 + C N + G, output width).
 
-    G may be 0. The outputs are those of ``ln_post`` for every token, in the order [CLS | 2D | 3D]; with an
-    ``embed_width``, times CLIP's projection into the joint embedding.
+    images: float32 (B, C, S, S, 3). point_tokens: (B, G, D), G may be 0. point_patches: int32 (B, G), camera * N +
+    patch. The outputs are those of ``ln_post`` for every token, in the order [CLS | 2D | 3D]; with an ``embed_width``,
+    times CLIP's projection into the joint embedding.
     """
 
     config: ModelConfig
 
     @nn.compact
-    def __call__(self, image: Array, point_tokens: Array, point_patches: Array) -> Array:
+    def __call__(self, images: Array, point_tokens: Array, point_patches: Array) -> Array:
         vision, dtype = self.config.vision, self.config.compute_dtype
-        expected = (vision.image_size, vision.image_size, 3)
-        if image.shape[1:] != expected:
+        cameras = self.config.cameras
+        expected = (cameras, vision.image_size, vision.image_size, 3)
+        if images.shape[1:] != expected:
             raise ValueError(
-                f"image: expected (B, {', '.join(map(str, expected))}), got {image.shape}; resize it in the encoding"
+                f"images: expected (B, {', '.join(map(str, expected))}), got {images.shape}; resize them in the "
+                "encoding, and give one of each camera that the model was made for"
             )
         if point_tokens.shape[-1] != vision.width:
             raise ValueError(
@@ -85,13 +90,18 @@ class VisionTower(nn.Module):
         class_embedding = self.param("class_embedding", embedding_init, (vision.width,))
         positions = self.param("positional_embedding", embedding_init, (1 + vision.num_patches, vision.width))
 
-        batch = image.shape[0]
-        pixels = patchify(image, vision.patch_size).astype(dtype)
+        batch = images.shape[0]
+        pixels = patchify(images.reshape(-1, *images.shape[2:]), vision.patch_size).astype(dtype)
         patches = pixels.reshape(-1, pixels.shape[-1]) @ kernel.reshape(-1, vision.width).astype(dtype)
-        patches = patches.reshape(batch, vision.num_patches, vision.width)
+        patches = patches.reshape(batch, cameras * vision.num_patches, vision.width)
         tokens_2d = jnp.concatenate(
             [jnp.broadcast_to(class_embedding, (batch, 1, vision.width)), patches.astype(jnp.float32)], axis=1
         )
+        # Where each token of the sequence is: CLS, the patches of every camera, and the patches of the 3D tokens.
+        if cameras > 1:
+            per_camera = self.param(CAMERA_EMBEDDING, nn.initializers.zeros_init(), (cameras, vision.width))
+            places = positions[1:] + per_camera[:, None]
+            positions = jnp.concatenate([positions[:1], places.reshape(-1, vision.width)])
         tokens_3d = point_tokens.astype(jnp.float32) + positions[1 + point_patches]
         x = jnp.concatenate([tokens_2d + positions, tokens_3d], axis=1)
 

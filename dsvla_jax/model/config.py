@@ -70,6 +70,7 @@ class VisionConfig:
 
     @property
     def num_patches(self) -> int:
+        """N: patches of one image."""
         return self.grid**2
 
     @property
@@ -263,6 +264,9 @@ class ModelConfig:
     """The vision tower."""
     language: LanguageConfig = LanguageConfig()
     """The language model."""
+    cameras: int = 1
+    """Cameras whose pictures it reads at a time, 1 to 4; as many as data.cameras. With more than one, the vision tower
+    has an embedding for each."""
     point_width: int | None = None
     """Channels of a 3D token; must be the vision tower's width, because 3D tokens enter it as they are. None means
     that."""
@@ -294,7 +298,7 @@ class ModelConfig:
     layers of the language model, training also skips what its last layer would compute for visual tokens."""
 
     def __post_init__(self):
-        check_fields(self, "model", point_width=COUNT, scan_unroll=COUNT)
+        check_fields(self, "model", cameras=at_least(1, at_most=4), point_width=COUNT, scan_unroll=COUNT)
         require(
             self.point_width in (None, self.vision.width),
             "model.point_width",

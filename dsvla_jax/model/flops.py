@@ -47,14 +47,14 @@ def model_flops(encoding: EncodingConfig, model: ModelConfig, regime: Regime) ->
 
 
 def prefill_flops(encoding: EncodingConfig, model: ModelConfig) -> dict[str, int]:
-    """Of reading one example's picture and prompt before an answer is decoded; the logits of one position."""
+    """Of reading one example's pictures and prompt before an answer is decoded; the logits of one position."""
     return _flops(encoding, model, "full", "inference")
 
 
 def _flops(encoding: EncodingConfig, config: ModelConfig, regime: Regime, passes: Passes) -> dict[str, int]:
     full, text = regime == "full", encoding.max_text_length
     vision, language, prompt = config.vision, config.language, config.visual_prompt
-    patches = vision.num_patches
+    patches = config.cameras * vision.num_patches
     tokens = 1 + patches + encoding.num_point_tokens
     training = passes == "training"
 

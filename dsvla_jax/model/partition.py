@@ -40,6 +40,7 @@ _PARAMETERS = {
     "output": ("embed", "vocab"),
     "patch_kernel": ("embed",),
     "positional_embedding": ("embed",),
+    "camera_embedding": ("embed",),
     "projection": ("embed", None),
     "adapter_query": ("embed",),
     "visual_query": ("embed",),

@@ -13,7 +13,10 @@ SHARED = {
 
 
 def require_same_sizes(encoding: EncodingConfig, model: ModelConfig) -> None:
-    """Raises UserError if the model was made for other pictures, patches or 3D tokens than the encoding gives."""
+    """Raises UserError if the model was made for other pictures, patches or 3D tokens than the encoding gives.
+
+    Also if alignment index_order has fewer patches than 3D tokens.
+    """
     vision = model.vision
     encoded = (encoding.image_size, encoding.patch_size, encoding.points.width)
     expected = (vision.image_size, vision.patch_size, vision.width)
@@ -23,6 +26,7 @@ def require_same_sizes(encoding: EncodingConfig, model: ModelConfig) -> None:
                 f"encoding.{ours} is {one} and {theirs} is {other}: {trouble}; set both to the same number "
                 f"({_option(f'encoding.{ours}')} {other}, or {_option(theirs)} {one})"
             )
+    encoding.require_patches(model.cameras)
 
 
 def _option(name: str) -> str:

@@ -7,6 +7,9 @@ import jax.numpy as jnp
 from flax import traverse_util
 
 PROJECTOR = "projector"
+CAMERA_EMBEDDING = "camera_embedding"
+# What answers with poses instead of text.
+POSE_HEAD = "pose_head"
 
 # Parameters that are cast to the model's dtype before anything is computed with them. Norms and positions are not.
 MATRICES = ("kernel", "embedding", "output", "projection", "patch_kernel")
@@ -22,10 +25,13 @@ def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Va
 
     `full`: everything learns. `lora`: the "lora" collection and the projector learn (paper, section 3.1). `adapters`:
     the "lora" collection alone, on a base whose projector is pretrained (as in the authors' released training code).
+    The embeddings of several cameras and a pose head learn always: no pretrained model has them.
     """
     flat = traverse_util.flatten_dict(variables)
 
     def learns(path: tuple[str, ...]) -> bool:
+        if path[-1] == CAMERA_EMBEDDING or path[1] == POSE_HEAD:
+            return True
         match regime:
             case "full":
                 return True

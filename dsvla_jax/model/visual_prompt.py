@@ -8,6 +8,7 @@ import dataclasses
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
 from dsvla_jax.model.layers import KERNEL_INIT, layer_norm, over_layers
@@ -35,11 +36,12 @@ def visual_blocks_config(config: ModelConfig) -> ModelConfig:
 
 
 class VisualPrompt(nn.Module):
-    """Vision outputs (B, 1 + N + G, vision output width) and point_patches int32 (B, G) -> the prompts of all layers.
+    """Vision outputs (B, 1 + C N + G, vision output width) and point_patches int32 (B, G) -> the prompts of all layers.
 
     The prompt of a layer is the projected tokens plus rows that the layer learns, one for each query, or for CLS and
     each image patch. A 3D token has the place and the rows of the patch that it is aligned with: its order among the
-    others means nothing, and no parameter depends on the number of 3D tokens. Layers that look at no prompt get zeros
+    others means nothing, and no parameter depends on the number of 3D tokens. The patches of all cameras share places
+    and rows, as they share positional embeddings. Layers that look at no prompt get zeros
     behind a gate of zero, so that all layers stay one loop.
     """
 
@@ -53,9 +55,11 @@ class VisualPrompt(nn.Module):
 
         x = LoraDense(prompt.width, name="clip_proj", **with_bias)(vision_outputs)
         x = layer_norm(1e-5, "clip_proj_norm")(x).astype(dtype)
-        row_count = 1 + self.config.vision.num_patches
-        rows = jnp.broadcast_to(jnp.arange(row_count), (batch, row_count))
-        rows = jnp.concatenate([rows, 1 + point_patches], axis=1)
+        patches = self.config.vision.num_patches
+        row_count = 1 + patches
+        of_images = np.concatenate([[0], *[np.arange(1, row_count)] * self.config.cameras])
+        rows = jnp.broadcast_to(of_images, (batch, len(of_images)))
+        rows = jnp.concatenate([rows, 1 + point_patches % patches], axis=1)
         positions, length = rows, row_count
         if prompt.queries:
             row_count = prompt.queries

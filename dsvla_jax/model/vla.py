@@ -57,8 +57,8 @@ class VLA(nn.Module):
         self.language = Llama(self.config)
 
     def encode_vision(self, inputs: ModelInputs) -> Array:
-        """The vision tower's outputs (B, 1 + N + G, vision output width), ordered [CLS | 2D | 3D]."""
-        return self.vision(inputs.image, inputs.point_tokens, inputs.point_patches)
+        """The vision tower's outputs (B, 1 + C N + G, vision output width), ordered [CLS | 2D | 3D]."""
+        return self.vision(inputs.images, inputs.point_tokens, inputs.point_patches)
 
     def hidden(self, inputs: ModelInputs, text_from: int = 0) -> Array:
         """Hidden states (B, T - text_from, width) of the text positions from ``text_from`` on."""
@@ -153,6 +153,17 @@ def number_embeddings(values: Array, width: int) -> Array:
     return jnp.pad(features, ((0, 0), (0, width - 2 * half)))
 
 
+def blank_inputs(config: ModelConfig) -> ModelInputs[Array]:
+    """Returns inputs of one example, for the shapes of variables."""
+    vision = config.vision
+    return ModelInputs(
+        images=jnp.zeros((1, config.cameras, vision.image_size, vision.image_size, 3)),
+        point_tokens=jnp.zeros((1, 1, vision.width)),
+        point_patches=jnp.zeros((1, 1), jnp.int32),
+        text=Text(jnp.zeros((1, 2), jnp.int32), jnp.ones((1, 2), bool)),
+    )
+
+
 def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Array | None = None) -> dict:
     """Random variables {"params", and "lora" where the config has adapters}. Pure: may be jitted with shardings.
 
@@ -160,14 +171,8 @@ def initialize(config: ModelConfig, key: Array, number_values: np.ndarray | Arra
         the embedding (and of an untied output) start as Fourier features of their value, at the scale of the others,
         so that near numbers start near. Without it numbers are as random as words.
     """
-    vision, language = config.vision, config.language
-    inputs = ModelInputs(
-        image=jnp.zeros((1, vision.image_size, vision.image_size, 3)),
-        point_tokens=jnp.zeros((1, 1, vision.width)),
-        point_patches=jnp.zeros((1, 1), jnp.int32),
-        text=Text(jnp.zeros((1, 2), jnp.int32), jnp.ones((1, 2), bool)),
-    )
-    variables = dict(jax.jit(VLA(config).init)(key, inputs))
+    language = config.language
+    variables = dict(jax.jit(VLA(config).init)(key, blank_inputs(config)))
     if number_values is not None:
         variables["params"] = embed_numbers(variables["params"], language, number_values)
     if config.base_dtype == "int8":

@@ -43,7 +43,7 @@ class SegmentationKeypoints:
     """Finds the keypoints of a batch of simulated episodes; a `loop.KeypointSource`.
 
     The simulator's masks of the task's objects, and the depth seen on them, go through the geometry that a robot's
-    pictures go through.
+    pictures go through. All are the front camera's, whatever cameras the policy has.
 
     state: the reset state of the B episodes. refresh: looks again before every keyframe, see `KeypointTracker`;
     otherwise the first frame's keypoints are kept. Raises UserError for a task that names no objects.
@@ -55,19 +55,21 @@ class SegmentationKeypoints:
         self._arms = [task.phrases(task.words(variation)) for variation in np.asarray(state.variation).tolist()]
         self._trackers = [KeypointTracker(functools.partial(self._segment, i), refresh) for i in range(len(self._arms))]
         self._refresh, self._masks = refresh, np.zeros(0, bool)
+        self._rgb, self._depth = np.zeros(0, np.uint8), np.zeros(0, np.float32)
 
-    def __call__(self, state: SimState, observation: Observation) -> tuple[np.ndarray, list[str]]:
+    def __call__(self, state: SimState, _: Observation) -> tuple[np.ndarray, list[str]]:
         """float32 (B, A, K, 3), and for each episode why it has none; the keypoints of such a one are zeros."""
         if self._refresh or not self._masks.size:
-            self._masks = object_masks(self._environment, state)
-        picture = observation.picture
-        rgb, depth = np.asarray(picture.rgb), np.asarray(picture.depth)
+            seen = self._environment.render(state)
+            self._masks = object_masks(self._environment, state, seen)
+            self._rgb, self._depth = np.asarray(seen.rgb), np.asarray(seen.depth)
+        rgb, depth = self._rgb, self._depth
         most = max(len(arm) for arm in self._arms[0])
         points = np.zeros((len(rgb), self._environment.num_arms, most, 3), np.float32)
         problems = [""] * len(rgb)
         for i, (tracker, arms) in enumerate(zip(self._trackers, self._arms, strict=True)):
             try:
-                camera = jax.tree.map(lambda x, i=i: x[i], picture.camera)
+                camera = jax.tree.map(lambda x, i=i: x[i], state.camera)
                 points[i] = tracker.keypoints(rgb[i], depth[i], camera, arms)
             except KeypointsNotFound as problem:
                 problems[i] = str(problem)

@@ -71,7 +71,12 @@ def planning_learner(experiment: Experiment) -> Learner[Any, Any]:
     """The experiment's policy as it learns, with the vocabulary of `planning_tokenizer`."""
     tokenizer = planning_tokenizer(experiment)
     return make_learner(
-        experiment.baseline, experiment.encoding, experiment.model, tokenizer, experiment.soft_target_sigma
+        experiment.baseline,
+        experiment.encoding,
+        experiment.model,
+        tokenizer,
+        experiment.soft_target_sigma,
+        experiment.num_cameras,
     )
 
 
@@ -103,11 +108,11 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
     state, frozen, _ = abstract_state(experiment, mesh)
     grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
     batch = abstract_batch(experiment, mesh)
-    asked = (batch.picture, batch.text)
+    asked = (batch.pictures, batch.text)
 
-    def decode(trainable: Variables, frozen: Variables, picture: Picture[Array], text: Text[Array]) -> Decoded:
+    def decode(trainable: Variables, frozen: Variables, pictures: Picture[Array], text: Text[Array]) -> Decoded:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
-            inputs = model_inputs(picture, text, experiment.encoding)
+            inputs = model_inputs(pictures, text, experiment.encoding)
             return decode_actions(VLA(experiment.model), join_variables(trainable, frozen), inputs, grammar)
 
     held = {
@@ -212,7 +217,8 @@ def abstract_batch(experiment: Experiment, mesh: Mesh, picture: tuple[int, int] 
     picture: height and width, those of simulated demonstrations if not given.
     """
     size = experiment.data.image_size
-    batch = planning_learner(experiment).example_spec(experiment.batch_size, *(picture or (size, size)))
+    cameras = experiment.num_cameras
+    batch = planning_learner(experiment).example_spec(experiment.batch_size, cameras, *(picture or (size, size)))
     return _placed(batch, jax.tree.map(lambda _: batch_sharding(mesh), batch))
 
 

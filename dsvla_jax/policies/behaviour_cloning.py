@@ -21,12 +21,12 @@ from dsvla_jax.encoding.pose_inputs import ARMS
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.quantize import quantize
 from dsvla_jax.model.variables import Variables
-from dsvla_jax.model.vla import VLA
+from dsvla_jax.model.vla import VLA, blank_inputs
 from dsvla_jax.policies.config import BehaviourCloningConfig
 from dsvla_jax.policies.pose_network import Vectors, mean_over_arm, weighted
 from dsvla_jax.policies.pose_vectors import VECTOR
-from dsvla_jax.policies.robot_vector import robot_vector
-from dsvla_jax.types import Array, ModelInputs, PoseInputs, Text
+from dsvla_jax.policies.robot_vector import robot_vector, with_waves
+from dsvla_jax.types import Array, ModelInputs, PoseInputs
 
 
 class PoseHead(nn.Module):
@@ -38,7 +38,7 @@ class PoseHead(nn.Module):
     @nn.compact
     def __call__(self, hidden: Array, robot: Array) -> Vectors:
         outputs = self.upcoming * ARMS * VECTOR
-        x = jnp.concatenate([hidden.astype(jnp.float32), robot], axis=-1)
+        x = jnp.concatenate([hidden.astype(jnp.float32), with_waves(robot)], axis=-1)
         for name in ("first", "second"):
             x = nn.gelu(nn.Dense(self.hidden, name=name)(x))
         answer = nn.Dense(outputs, name="out", kernel_init=nn.initializers.zeros_init())(x)
@@ -86,13 +86,7 @@ class BehaviourCloning:
 
     def initialise(self, key: Array) -> Variables:
         """See `PoseNetwork`."""
-        vision = self.model.vision
-        blank = ModelInputs(
-            image=jnp.zeros((1, vision.image_size, vision.image_size, 3)),
-            point_tokens=jnp.zeros((1, 1, vision.width)),
-            point_patches=jnp.zeros((1, 1), jnp.int32),
-            text=Text(jnp.zeros((1, 2), jnp.int32), jnp.ones((1, 2), bool)),
-        )
+        blank = blank_inputs(self.model)
         robot = jnp.zeros((1, ARMS * (VECTOR + 5)))
         variables = dict(jax.jit(lambda key: self._network.init(key, blank, robot, method=PoseVLA.poses))(key))
         if self.model.base_dtype == "int8":
@@ -100,7 +94,7 @@ class BehaviourCloning:
         return variables
 
     def _poses(self, variables: Variables, inputs: PoseInputs[Array], key: Array) -> Vectors:
-        read = model_inputs(inputs.picture, inputs.words, self.encoding)
+        read = model_inputs(inputs.pictures, inputs.words, self.encoding)
         robot = robot_vector(inputs, self._codec)
         poses = self._network.apply(variables, read, robot, method=PoseVLA.poses, rngs={"dropout": key})
         return cast(Vectors, poses)

@@ -25,7 +25,7 @@ from dsvla_jax.policies.config import DP3Config
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
 from dsvla_jax.policies.pose_network import Vectors, mean_over_arm
 from dsvla_jax.policies.pose_vectors import VECTOR, center, scale_position
-from dsvla_jax.policies.robot_vector import robot_vector
+from dsvla_jax.policies.robot_vector import robot_vector, with_waves
 from dsvla_jax.types import Array, PoseInputs, Text
 
 HEADS, GROUPS, KERNEL = 4, 8, 5
@@ -64,7 +64,7 @@ class Condition(nn.Module):
             seen += attention(nn.LayerNorm(name=f"query_norm_{number}")(seen)[:, None], embedded, mask=mask)[:, 0]
         count = words.mask.sum(axis=1, keepdims=True)
         mean = jnp.where(words.mask[..., None], embedded, 0).sum(axis=1) / count
-        state = nn.Dense(width, name="robot_out")(nn.relu(nn.Dense(width, name="robot_in")(robot)))
+        state = nn.Dense(width, name="robot_out")(nn.relu(nn.Dense(width, name="robot_in")(with_waves(robot))))
         return jnp.concatenate([seen, mean, state], axis=-1)
 
 
@@ -164,7 +164,7 @@ class DP3:
 
     def _condition(self, variables: Variables, inputs: PoseInputs[Array]) -> Array:
         codec = self.encoding.codec
-        points, colours = coloured_cloud(inputs.picture, self.encoding)
+        points, colours = coloured_cloud(inputs.pictures, self.encoding)
         points = scale_position(points, center(codec), codec)
         if self.config.colours:
             points = jnp.concatenate([points, colours], axis=-1)

@@ -71,8 +71,8 @@ class Learner(Protocol[ExampleT, HeldOutT]):
         """Floating-point operations of matrix products of one example in one training step, without recomputation."""
         ...
 
-    def example_spec(self, batch: int, height: int, width: int) -> object:
-        """Shapes and dtypes of a training batch with pictures of (height, width)."""
+    def example_spec(self, batch: int, cameras: int, height: int, width: int) -> object:
+        """Shapes and dtypes of a training batch with pictures of (height, width) of so many cameras."""
         ...
 
 

@@ -36,6 +36,8 @@ class PoseLearner:
 
     network: PoseNetwork
     encoding: EncodingConfig
+    cameras: int = 1
+    """C, in its examples."""
 
     progress = ("position_cm", "position cm")
 
@@ -76,7 +78,7 @@ class PoseLearner:
         """See `Learner`: counted in the traced gradient, in which everything learns."""
         encoding = self.encoding
         side = max(encoding.image_size, encoding.stride * math.ceil(encoding.points.num_points**0.5))
-        batch = self.example_spec(1, side, side)
+        batch = self.example_spec(1, self.cameras, side, side)
         variables = jax.eval_shape(self.initialise, jax.random.key(0))
 
         def loss(variables: Variables, batch: PoseExample[Array]) -> Array:
@@ -84,9 +86,9 @@ class PoseLearner:
 
         return product_flops(jax.make_jaxpr(jax.grad(loss))(variables, batch).jaxpr)
 
-    def example_spec(self, batch: int, height: int, width: int) -> PoseExample[jax.ShapeDtypeStruct]:
+    def example_spec(self, batch: int, cameras: int, height: int, width: int) -> PoseExample[jax.ShapeDtypeStruct]:
         """See `Learner`."""
-        return pose_example_spec(batch, height, width, self.encoding.max_text_length, self.network.upcoming)
+        return pose_example_spec(batch, cameras, height, width, self.encoding.max_text_length, self.network.upcoming)
 
 
 def target_vectors(batch: PoseExample[Array], codec: PoseCodec) -> Vectors:
@@ -164,7 +166,7 @@ class PosePolicy:
         near = None
         if keypoints is not None and self.config.wants_keypoints:
             near = np.asarray(keypoints, np.float32)
-        inputs = pose_inputs(observation.picture, robot, words, near)
+        inputs = pose_inputs(observation.pictures, robot, words, near)
         key = jax.random.key(ANSWER_SEED) if key is None else key
         action = _act(self.network, self.codec, self.variables, filled_up(inputs, size), key)
         action = Action(action.pose[:size, :arms], action.gripper_open[:size, :arms])
@@ -203,7 +205,7 @@ class PoseOnDevice:
     ) -> tuple[Action[Array], Action[Array]]:
         """See `DevicePolicy`."""
         near = keypoints if self.policy.config.wants_keypoints else None
-        inputs = pose_inputs(observation.picture, observation.robot, question, near)
+        inputs = pose_inputs(observation.pictures, observation.robot, question, near)
         vectors = self.policy.network.answer(variables, inputs, jax.random.key(ANSWER_SEED))
         action = first_keyframe(vectors, inputs, self.policy.codec)
         action = Action(action.pose[:, : self.arms], action.gripper_open[:, : self.arms])

@@ -20,15 +20,16 @@ def make_learner(
     model: ModelConfig,
     tokenizer: Tokenizer,
     soft_target_sigma: float = 0.0,
+    cameras: int = 1,
 ) -> Learner[Any, Any]:
     """How a policy learns, from examples of its own kind.
 
-    baseline: None for 3DS-VLA. soft_target_sigma: see `text_learner`.
+    baseline: None for 3DS-VLA. soft_target_sigma: see `text_learner`. cameras: C, in examples.
     """
     if baseline is None:
         return text_learner(encoding, model, tokenizer, soft_target_sigma)
     network = make_network(baseline, encoding, model, tokenizer)
-    return PoseLearner(network, encoding)
+    return PoseLearner(network, encoding, cameras)
 
 
 def make_policy(

@@ -7,6 +7,9 @@ from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.policies.pose_vectors import center, scale_position, to_vectors
 from dsvla_jax.types import Array, PoseInputs
 
+# Wavelengths of `with_waves`: the shortest is 6 cm in a box of 2 m.
+WAVES = 6
+
 
 def robot_vector(inputs: PoseInputs[Array], codec: PoseCodec) -> Float[Array, "b 30"]:
     """Each arm's pose and gripper (10), whether it is there, its keypoint from where it is (3), and whether one is."""
@@ -17,3 +20,13 @@ def robot_vector(inputs: PoseInputs[Array], codec: PoseCodec) -> Float[Array, "b
     keypoints = jnp.where(near, scale_position(inputs.keypoints, pose[..., :3], codec), 0)
     parts = jnp.concatenate([state, there, keypoints, near], axis=-1)
     return parts.reshape(len(parts), -1)
+
+
+def with_waves(vector: Float[Array, "b r"]) -> Float[Array, "b w"]:
+    """The vector, and sines and cosines of it at wavelengths from twice the box's half sides down to a 32nd of that.
+
+    Whether an arm has reached a keypoint is a matter of centimetres, which a layer does not tell from metres.
+    """
+    angles = jnp.pi * vector[..., None] * 2.0 ** jnp.arange(WAVES)
+    waves = jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1)
+    return jnp.concatenate([vector, waves.reshape(len(vector), -1)], axis=-1)

@@ -57,7 +57,7 @@ class TextLearner:
 
     def logits(self, variables: Variables, example: Example[Array], key: Array) -> Float[Array, "b t v"]:
         """Predicts each token of a batch's texts from those before it. key: for dropout."""
-        inputs = model_inputs(example.picture, example.text, self.encoding)
+        inputs = model_inputs(example.pictures, example.text, self.encoding)
         logits = VLA(self.model).apply(variables, inputs, rngs={"dropout": key})
         assert isinstance(logits, jax.Array)
         return logits
@@ -86,9 +86,9 @@ class TextLearner:
         """See `Learner`."""
         return model_flops(self.encoding, self.model, regime)
 
-    def example_spec(self, batch: int, height: int, width: int) -> Example[jax.ShapeDtypeStruct]:
+    def example_spec(self, batch: int, cameras: int, height: int, width: int) -> Example[jax.ShapeDtypeStruct]:
         """See `Learner`."""
-        return example_spec(self.encoding, batch, height, width)
+        return example_spec(self.encoding, batch, cameras, height, width)
 
 
 def text_learner(
@@ -118,7 +118,7 @@ def _decode(
     text: Text[Array],
     key: Array | None,
 ) -> Decoded:
-    inputs = model_inputs(observation.picture, text, config.encoding)
+    inputs = model_inputs(observation.pictures, text, config.encoding)
     grammar = build_answer_grammar(tokenizer, observation.robot.pose.shape[1], config.encoding.style)
     return decode_actions(VLA(config.model), variables, inputs, grammar, decoding, key)
 
@@ -236,7 +236,7 @@ class TextOnDevice:
             integers = jnp.concatenate([integers, near], axis=1)
         size = self._longest + self._table.longest
         prompts = Text(*write_prompts(self._table, beginnings, lengths, integers, size, self.tokenizer.pad_id))
-        inputs = model_inputs(observation.picture, prompts, encoding)
+        inputs = model_inputs(observation.pictures, prompts, encoding)
         grammar = build_answer_grammar(self.tokenizer, self.arms, encoding.style)
         answer = decode_actions(VLA(self.config.model), variables, inputs, grammar, self.decoding, None).integers
         return encoding.codec.decode(answer), answer

@@ -106,7 +106,7 @@ def _parse_size(text: str) -> tuple[int, int]:
 
 def _check_size(size: tuple[int, int], config: PolicyConfig) -> None:
     encoding = config.encoding
-    candidates = -(-size[0] // encoding.stride) * -(-size[1] // encoding.stride)
+    candidates = config.model.cameras * -(-size[0] // encoding.stride) * -(-size[1] // encoding.stride)
     if encoding.use_points and candidates < encoding.points.num_points:
         raise UserError(
             f"--image-size: {size[0]}x{size[1]} has {candidates} points at the policy's stride of {encoding.stride}; "
@@ -129,7 +129,7 @@ def _learned_before(run: Path, config: PolicyConfig) -> LearnedFrom | None:
         image_size=(data.image_size, data.image_size),
         arms=tuple(sorted({get_task(name).num_arms for name in tasks})),
         tasks=tasks,
-        camera="front",
+        cameras=data.cameras,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.policies.interface import BATCH_SIZES, Policy
-from dsvla_jax.types import TABLE_HEIGHT, Observation, Picture, RobotState
+from dsvla_jax.types import TABLE_HEIGHT, Observation, Picture, RobotState, join_cameras
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Question:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(A, H, W): questions of one shape can share a batch."""
-        return (*self.observation.robot.gripper_open.shape, *self.observation.picture.depth.shape)
+        """(A, C, H, W): questions of one shape can share a batch."""
+        return (*self.observation.robot.gripper_open.shape, *self.observation.pictures.depth.shape)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,13 +78,13 @@ def answer_batch(policy: Policy, questions: Sequence[Question], prompt_tokens: i
     ]
 
 
-def blank_question(arms: int, height: int, width: int) -> Question:
+def blank_question(arms: int, cameras: int, height: int, width: int) -> Question:
     """A well-formed question about an empty table, for warming up."""
     camera = jax.tree.map(np.asarray, front_camera(height))
     pose = np.tile(np.array([0.3, 0.0, TABLE_HEIGHT + 0.5, 0.0, 1.0, 0.0, 0.0], np.float32), (arms, 1))
     picture = Picture(np.zeros((height, width, 3), np.uint8), np.ones((height, width), np.float32), camera)
     robot = RobotState(pose, np.ones(arms, np.float32))
-    return Question("", Observation(picture, robot), pose[:, :3])
+    return Question("", Observation(join_cameras([picture] * cameras), robot), pose[:, :3])
 
 
 class MicroBatcher:

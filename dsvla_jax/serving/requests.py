@@ -17,7 +17,7 @@ from dsvla_jax.observation_checks import (
     check_workspace,
     points_in_workspace,
 )
-from dsvla_jax.types import Camera, Observation, Picture, RobotState
+from dsvla_jax.types import Camera, Observation, Picture, RobotState, split_cameras
 
 MAX_KEYPOINTS = 16
 MAX_PROMPT = 1000  # characters
@@ -48,6 +48,8 @@ class Expected:
 
     image_sizes: (H, W) each. arms: numbers of arms. encoding: of the policy, which knows both workspaces.
     keypoints: whether robots may send keypoints. depth: whether the policy, or what finds keypoints, reads depth.
+    cameras: the names of those whose pictures robots send. Of one camera, fields have no camera axis; of several they
+    have one in front, in the order of the names.
     """
 
     image_sizes: tuple[tuple[int, int], ...]
@@ -55,6 +57,7 @@ class Expected:
     encoding: EncodingConfig
     keypoints: bool = True
     depth: bool = True
+    cameras: tuple[str, ...] = ("camera",)
 
     @property
     def codec(self) -> PoseCodec:
@@ -64,12 +67,22 @@ class Expected:
     @property
     def required(self) -> dict[str, str]:
         """The fields of every request, described."""
-        return {name: what for name, what in FIELDS.items() if self.depth or name not in DEPTH_FIELDS}
+        return {name: what for name, what in self.fields.items() if self.depth or name not in DEPTH_FIELDS}
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """All fields but the optional ones, described."""
+        count = len(self.cameras)
+        if count == 1:
+            return FIELDS
+        order = f", of each of {', '.join(self.cameras)}"
+        more = {name: FIELDS[name].replace("(", f"({count}, ", 1) + order for name in ("rgb", *DEPTH_FIELDS)}
+        return {**FIELDS, **more}
 
     @property
     def optional(self) -> dict[str, str]:
         """The other fields, described."""
-        others = {name: what for name, what in FIELDS.items() if name not in self.required}
+        others = {name: what for name, what in self.fields.items() if name not in self.required}
         return others | OPTIONAL_FIELDS
 
     @property
@@ -79,7 +92,8 @@ class Expected:
         Colour and depth count in double precision, so that a picture of another type arrives and is refused by its
         name.
         """
-        return max(height * width for height, width in self.image_sizes) * (3 + 1) * 8 + 2**16
+        pixels = max(height * width for height, width in self.image_sizes) * len(self.cameras)
+        return pixels * (3 + 1) * 8 + 2**16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +101,7 @@ class Request:
     """One observation, float32 and uint8 NumPy arrays without a batch axis.
 
     keypoints: float32 (A, K, 3), metres, world frame, or None. reset: whether an episode begins.
-    points: of the depth map that lie in the policy's workspace, at its stride; None for a policy without 3D input.
+    points: of the depth maps that lie in the policy's workspace, at its stride; None for a policy without 3D input.
     """
 
     instruction: str
@@ -99,7 +113,7 @@ class Request:
     @property
     def shape(self) -> tuple[int, int, int]:
         """(A, H, W): requests of one shape can be answered together."""
-        return (len(self.observation.robot.pose), *self.observation.picture.rgb.shape[:2])
+        return (len(self.observation.robot.pose), *self.observation.pictures.rgb.shape[1:3])
 
 
 def parse_request(message: Any, expected: Expected) -> Request:
@@ -114,21 +128,25 @@ def parse_request(message: Any, expected: Expected) -> Request:
 
 
 def check_first_keypoints(request: Request, keypoints: np.ndarray) -> None:
-    """Raises BadRequest unless an episode's first keypoints (A, K, 3) are before the camera, and one is in the picture.
+    """Raises BadRequest unless an episode's first keypoints (A, K, 3) are before a camera, and one is in its picture.
 
-    Finds an inverse or foreign world_from_camera. Later, objects may leave the view of a camera that moves.
+    Finds an inverse or foreign world_from_camera. Later, objects may leave the view of a camera that moves. One of
+    several cameras must see them: another one, such as on a wrist, need not.
     """
-    picture = request.observation.picture
-    camera, size = picture.camera, picture.depth.shape
-    if not np.any(picture.depth):
+    pictures = request.observation.pictures
+    if not np.any(pictures.depth):
         return  # neither depth nor camera was sent
     # Filled up with the last, which changes nothing, so that every number of keypoints runs what is compiled already.
     padded = np.pad(keypoints, ((0, 0), (0, max(MAX_KEYPOINTS - keypoints.shape[1], 0)), (0, 0)), "edge")
-    where = (np.asarray(camera.intrinsics), np.asarray(camera.world_from_camera), size, "request")
-    with contextlib.suppress(DataError):
-        return check_keypoints(padded, *where)
+    looks = [
+        (np.asarray(one.camera.intrinsics), np.asarray(one.camera.world_from_camera), one.depth.shape, "request")
+        for one in split_cameras(pictures)
+    ]
+    for look in looks:
+        with contextlib.suppress(DataError):
+            return check_keypoints(padded, *look)
     try:
-        check_keypoints(keypoints, *where)  # for its message, which lists them
+        check_keypoints(keypoints, *looks[0])  # for its message, which lists them
     except DataError as error:
         raise BadRequest(str(error)) from error
 
@@ -141,7 +159,7 @@ def _parse(message: Any, expected: Expected) -> Request:
     if sent := [name for name in DEPTH_FIELDS if name in message]:
         missing += [name for name in DEPTH_FIELDS if name not in {*sent, *missing}]  # these go together
     if unknown or missing:
-        described = "; ".join(f"{name}: {what}" for name, what in {**FIELDS, **OPTIONAL_FIELDS}.items())
+        described = "; ".join(f"{name}: {what}" for name, what in {**expected.fields, **OPTIONAL_FIELDS}.items())
         raise BadRequest(f"request: missing {missing}, unknown {unknown[:8]}; the fields are {described}")
     instruction, reset = message["prompt"], message.get("reset", False)
     if not isinstance(instruction, str) or not instruction.strip() or len(instruction) > MAX_PROMPT:
@@ -149,17 +167,7 @@ def _parse(message: Any, expected: Expected) -> Request:
     if not isinstance(reset, bool | np.bool_):
         raise BadRequest(f"reset: expected {OPTIONAL_FIELDS['reset']}, got {_describe(reset)}")
 
-    rgb = message["rgb"]
-    sizes = " or ".join(f"({height}, {width}, 3)" for height, width in expected.image_sizes)
-    if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8 or rgb.shape[2:] != (3,):
-        scale = "; multiply numbers from 0 to 1 by 255" if isinstance(rgb, np.ndarray) and rgb.dtype.kind == "f" else ""
-        raise BadRequest(f"rgb: expected a uint8 array {sizes}, got {_describe(rgb)}; send uint8{scale}")
-    if rgb.shape[:2] not in expected.image_sizes:
-        raise BadRequest(
-            f"rgb: expected {sizes}, got {rgb.shape}; resize it with its depth and intrinsics, or start the server "
-            "with --image-size HEIGHTxWIDTH"
-        )
-    depth, camera, points = _depth_and_camera(message, rgb, expected)
+    pictures, points = _pictures(message, expected)
     pose = _floats(message, "pose", (None, 7))
     arms = len(pose)
     if arms not in expected.arms:
@@ -183,42 +191,78 @@ def _parse(message: Any, expected: Expected) -> Request:
         if not 1 <= keypoints.shape[1] <= MAX_KEYPOINTS:
             raise BadRequest(f"keypoints: expected {OPTIONAL_FIELDS['keypoints']}, got K = {keypoints.shape[1]}")
         _check_inside("keypoints", keypoints, expected.codec)
-    observation = Observation(Picture(message["rgb"], depth, camera), RobotState(unit_pose, gripper_open))
+    observation = Observation(pictures, RobotState(unit_pose, gripper_open))
     return Request(instruction, observation, keypoints, bool(reset), points)
 
 
-def _depth_and_camera(message: dict, rgb: np.ndarray, expected: Expected) -> tuple[Any, Camera, int | None]:
-    """The depth map with 0 for every missing reading, its camera, and the points that the policy makes 3D tokens of."""
+def _pictures(message: dict, expected: Expected) -> tuple[Picture[np.ndarray], int | None]:
+    """The pictures of all cameras, and how many of their points the policy makes 3D tokens of."""
+    rgb = _rgb(message["rgb"], expected)
+    count, *size = rgb.shape[:3]
     if "depth" not in message:
-        blank: Any = np.eye(4, dtype=np.float32)
-        return np.zeros(rgb.shape[:2], np.float32), Camera(blank[:3, :3], blank), None
-    depth = _floats(message, "depth", rgb.shape[:2], finite=False)
+        blank: Any = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
+        return Picture(rgb, np.zeros((count, *size), np.float32), Camera(blank[:, :3, :3], blank)), None
+    fields = expected.fields
+
+    def of_cameras(name: str, shape: tuple[int, ...], finite: bool = True) -> Any:
+        axis = (count,) if len(expected.cameras) > 1 else ()
+        return _floats(message, name, (*axis, *shape), finite, fields[name]).reshape(count, *shape)
+
+    depth = of_cameras("depth", tuple(size), finite=False)
     depth = np.where(np.isfinite(depth), depth, np.float32(0))
-    intrinsics = _floats(message, "intrinsics", (3, 3))
-    world_from_camera = _floats(message, "world_from_camera", (4, 4))
-    check_pictures(rgb, depth, "request")
-    check_camera(intrinsics.astype(np.float64), world_from_camera.astype(np.float64), rgb.shape[:2], "request")
-    encoding, points = expected.encoding, None
-    if encoding.use_points:
-        stride, box = encoding.stride, (encoding.workspace_low, encoding.workspace_high)
-        candidates = depth[::stride, ::stride]
-        strided = np.diag([1 / stride, 1 / stride, 1]) @ intrinsics
-        points, readings = points_in_workspace(candidates, strided, world_from_camera, *box)
-        blocked = "is something in front of the camera?"
-        try:
-            check_workspace(points, readings, *box, "request")
-        except DataError as error:
-            raise BadRequest(f"{error}; {blocked}") from error
-        if points < encoding.num_point_tokens:
-            raise BadRequest(
-                f"depth: expected at least {encoding.num_point_tokens} points in the workspace, one for each 3D token, "
-                f"got {points} of {candidates.size} pixels; check that the depth stream is on; {blocked}"
-            )
-    return depth, Camera(intrinsics, world_from_camera), points
+    camera = Camera(of_cameras("intrinsics", (3, 3)), of_cameras("world_from_camera", (4, 4)))
+    pictures = Picture(rgb, depth, camera)
+    for name, one in zip(expected.cameras, split_cameras(pictures), strict=True):
+        where = "request" if count == 1 else f"request, camera {name}"
+        check_pictures(one.rgb, one.depth, where)
+        calibration = (one.camera.intrinsics.astype(np.float64), one.camera.world_from_camera.astype(np.float64))
+        check_camera(*calibration, one.rgb.shape[:2], where)
+    return pictures, _count_points(pictures, expected.encoding) if expected.encoding.use_points else None
 
 
-def _floats(message: dict, name: str, shape: tuple[int | None, ...], finite: bool = True) -> Any:
-    what, value = {**FIELDS, **OPTIONAL_FIELDS}[name], message[name]
+def _rgb(rgb: Any, expected: Expected) -> np.ndarray:
+    """uint8 (C, H, W, 3)."""
+    count = len(expected.cameras)
+    axis = "" if count == 1 else f"{count}, "
+    sizes = " or ".join(f"({axis}{height}, {width}, 3)" for height, width in expected.image_sizes)
+    if count > 1:
+        sizes += f" of {', '.join(expected.cameras)}"
+    if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8 or rgb.ndim != 3 + (count > 1) or rgb.shape[-1] != 3:
+        scale = "; multiply numbers from 0 to 1 by 255" if isinstance(rgb, np.ndarray) and rgb.dtype.kind == "f" else ""
+        raise BadRequest(f"rgb: expected a uint8 array {sizes}, got {_describe(rgb)}; send uint8{scale}")
+    stacked = rgb if count > 1 else rgb[None]
+    if len(stacked) != count or stacked.shape[1:3] not in expected.image_sizes:
+        raise BadRequest(
+            f"rgb: expected {sizes}, got {rgb.shape}; resize it with its depth and intrinsics, or start the server "
+            "with --image-size HEIGHTxWIDTH"
+        )
+    return stacked
+
+
+def _count_points(pictures: Picture[np.ndarray], encoding: EncodingConfig) -> int:
+    """How many points of all cameras lie in the workspace. Raises BadRequest if these are too few."""
+    stride, box = encoding.stride, (encoding.workspace_low, encoding.workspace_high)
+    candidates = pictures.depth[:, ::stride, ::stride]
+    points = readings = 0
+    for depth, one in zip(candidates, split_cameras(pictures), strict=True):
+        strided = np.diag([1 / stride, 1 / stride, 1]) @ one.camera.intrinsics
+        inside, measured = points_in_workspace(depth, strided, one.camera.world_from_camera, *box)
+        points, readings = points + inside, readings + measured
+    blocked = "is something in front of the camera?"
+    try:
+        check_workspace(points, readings, *box, "request")
+    except DataError as error:
+        raise BadRequest(f"{error}; {blocked}") from error
+    if points < encoding.num_point_tokens:
+        raise BadRequest(
+            f"depth: expected at least {encoding.num_point_tokens} points in the workspace, one for each 3D token, "
+            f"got {points} of {candidates.size} pixels; check that the depth stream is on; {blocked}"
+        )
+    return points
+
+
+def _floats(message: dict, name: str, shape: tuple[int | None, ...], finite: bool = True, described: str = "") -> Any:
+    what, value = described or {**FIELDS, **OPTIONAL_FIELDS}[name], message[name]
     if not isinstance(value, np.ndarray | list):
         raise BadRequest(f"{name}: expected {what}, got {_describe(value)}")
     if name == "depth" and isinstance(value, np.ndarray) and value.dtype.kind in "iu":

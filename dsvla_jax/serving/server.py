@@ -38,7 +38,7 @@ from dsvla_jax.serving.batching import (
     prompt_length,
 )
 from dsvla_jax.serving.messages import pack, unpack
-from dsvla_jax.serving.metadata import describe
+from dsvla_jax.serving.metadata import camera_names, describe
 from dsvla_jax.serving.metrics import Metrics
 from dsvla_jax.serving.requests import (
     OPTIONAL_FIELDS,
@@ -124,6 +124,7 @@ class PolicyServer:
             encoding,
             keypoints=policy.config.wants_keypoints or not encoding.use_keypoints,
             depth=encoding.use_points or perception is not None,
+            cameras=camera_names(policy.config),
         )
         self.metrics = Metrics()
         self._policy, self._token, self._name = policy, token, name
@@ -178,7 +179,7 @@ class PolicyServer:
             for height, width in self.expected.image_sizes:
                 for size in sizes:
                     started = time.monotonic()
-                    question = blank_question(arms, height, width)
+                    question = blank_question(arms, len(self.expected.cameras), height, width)
                     await asyncio.to_thread(self._answer, [question] * size)
                     log.info(
                         "%d arm(s), %d x %d pixels, batch of %d: compiled in %.1f s",
@@ -187,7 +188,8 @@ class PolicyServer:
 
     def _warm_up_checks(self) -> None:
         for arms in self.expected.arms:
-            blank = Request("", blank_question(arms, *self.expected.image_sizes[0]).observation, None, True)
+            question = blank_question(arms, len(self.expected.cameras), *self.expected.image_sizes[0])
+            blank = Request("", question.observation, None, True)
             check_first_keypoints(blank, np.full((arms, 1, 3), (0.3, 0.0, TABLE_HEIGHT), np.float32))
 
     def _http(self, connection: ServerConnection, request: HttpRequest) -> Response | None:

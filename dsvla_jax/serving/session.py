@@ -8,6 +8,7 @@ import numpy as np
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
 from dsvla_jax.perception.keypoints import KeypointTracker
 from dsvla_jax.serving.requests import Request
+from dsvla_jax.types import split_cameras
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,12 +33,15 @@ class Session:
         self._progress: Progress | None = None
 
     def look(self, request: Request, arms: Sequence[Sequence[str]]) -> np.ndarray:
-        """The keypoints (A, K, 3) of the phrases for each arm, seen in this picture or before in the episode."""
+        """The keypoints (A, K, 3) of the phrases for each arm, seen in this picture or before in the episode.
+
+        Of several cameras, the first one's picture is looked at.
+        """
         if self._tracker is None:
             raise ValueError("Session.look: made without a tracker")
         if request.reset or self._progress is None or request.instruction != self._progress.instruction:
             self._tracker.reset()
-        seen = request.observation.picture
+        seen = split_cameras(request.observation.pictures)[0]
         return self._tracker.keypoints(seen.rgb, seen.depth, seen.camera, arms)
 
     def begins(self, request: Request, keypoints: np.ndarray) -> bool:

@@ -10,17 +10,16 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.geometry.cameras import make_camera
 from dsvla_jax.geometry.rotations import quaternion_to_matrix
 from dsvla_jax.sim.kinematics import forward_kinematics
 from dsvla_jax.sim.physics import SimState
-from dsvla_jax.sim.rendering import Renderer, render_from
+from dsvla_jax.sim.rendering import Renderer, Rendering, render, render_from
 from dsvla_jax.sim.robot import Arm
 from dsvla_jax.sim.scene import Scene
-from dsvla_jax.types import Array, Camera
+from dsvla_jax.types import Array, Camera, Picture
 
 FRONT = "front"
 SINGLE_WRIST, DUAL_WRISTS = ("wrist",), ("wrist_left", "wrist_right")
@@ -58,22 +57,6 @@ TOOL_FROM_WRIST_CAMERA = np.array(
 )
 
 
-@struct.dataclass
-class CameraViews:
-    """What C cameras see of B episodes.
-
-    rgb: uint8 (B, C, H, W, 3). depth: float32 (B, C, H, W), planar, metres; 0 where nothing is hit.
-    intrinsics: float32 (B, C, 3, 3). world_from_camera: float32 (B, C, 4, 4), camera-to-world.
-    names: of the C cameras.
-    """
-
-    rgb: Array
-    depth: Array
-    intrinsics: Array
-    world_from_camera: Array
-    names: tuple[str, ...] = struct.field(pytree_node=False)
-
-
 def camera_names(num_arms: int) -> tuple[str, ...]:
     """Returns the cameras of a scene with 1 or 2 arms."""
     return (FRONT, *FIXED, *(SINGLE_WRIST if num_arms == 1 else DUAL_WRISTS))
@@ -109,14 +92,26 @@ def place_camera(scene: Scene, name: str, image_size: int, state: SimState) -> C
     )
 
 
-def observe_cameras(scene: Scene, renderer: Renderer, names: Sequence[str], state: SimState) -> CameraViews:
-    """Draws B episodes from several cameras, stacked in the order of ``names``."""
-    cameras = [place_camera(scene, name, renderer.image_size, state) for name in names]
-    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(each) for each in x]), *cameras)  # (C, B, ...)
-    # One camera after the other: one program, and the memory of one picture an episode.
-    pictures = jax.lax.map(lambda camera: render_from(renderer, state, camera), stacked)
-    rgb, depth, stacked = jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), (pictures.rgb, pictures.depth, stacked))
-    return CameraViews(rgb, depth, stacked.intrinsics, stacked.world_from_camera, tuple(names))
+def take_pictures(
+    scene: Scene, renderer: Renderer, names: Sequence[str], state: SimState, front: Rendering | None = None
+) -> Picture[Array]:
+    """Draws B episodes from several cameras: rgb uint8 (B, C, H, W, 3) and so on, in the order of ``names``.
+
+    Depth is 0 where nothing is hit. front: what `render` drew of this state, if it is there already.
+    """
+    others = [name for name in names if name != FRONT]
+    pictures: dict[str, Picture[Array]] = {}
+    if FRONT in names:
+        front = render(renderer, state) if front is None else front
+        pictures[FRONT] = Picture(front.rgb, front.depth, state.camera)
+    if others:
+        cameras = [place_camera(scene, name, renderer.image_size, state) for name in others]
+        stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(each) for each in x]), *cameras)  # (C, B, ...)
+        # One camera after the other: one program, and the memory of one picture an episode.
+        drawn = jax.lax.map(lambda camera: render_from(renderer, state, camera), stacked)
+        for c, name in enumerate(others):
+            pictures[name] = jax.tree.map(lambda x, c=c: x[c], Picture(drawn.rgb, drawn.depth, stacked))
+    return jax.tree.map(lambda *x: jnp.stack(x, axis=1), *[pictures[name] for name in names])
 
 
 def _wrist_pose(arm: Arm, qpos: Array) -> Array:

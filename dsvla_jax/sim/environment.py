@@ -14,7 +14,7 @@ import numpy as np
 
 from dsvla_jax.command_line import require_usual_draws
 from dsvla_jax.sim import controller
-from dsvla_jax.sim.cameras import FRONT, CameraViews, check_cameras, observe_cameras
+from dsvla_jax.sim.cameras import FRONT, check_cameras, take_pictures
 from dsvla_jax.sim.mujoco_physics import MujocoPhysics
 from dsvla_jax.sim.physics import Engine, Physics, SimState, Verdict, initial_state, jit_with_mjx
 from dsvla_jax.sim.rendering import Renderer, Rendering, make_renderer, render
@@ -70,9 +70,12 @@ def step(scene: Scene, physics: Physics, state: SimState, action: Action) -> Sim
         return physics.compile_part(_attach, scene)(state, plan.ok, plan.closing)
 
 
-def observe(scene: Scene, renderer: Renderer, state: SimState) -> Observation:
-    """Returns what a policy sees of the B episodes; every field with the batch in front, the camera's too."""
-    return _observation(render(renderer, state), end_effectors(scene, state), state)
+def observe(scene: Scene, renderer: Renderer, cameras: Sequence[str], state: SimState) -> Observation:
+    """Returns what a policy sees of the B episodes; every field with the batch in front, the cameras' too.
+
+    cameras: names, see `sim/cameras.py`; the order of the pictures' camera axis.
+    """
+    return _observation(take_pictures(scene, renderer, cameras, state), end_effectors(scene, state))
 
 
 def judge(scene: Scene, state: SimState) -> Verdict:
@@ -171,9 +174,8 @@ def taken(scene: Scene, state: SimState) -> Taken:
     return jax.vmap(one)(state)
 
 
-def _observation(rendering: Rendering, hands: EndEffectors, state: SimState) -> Observation:
-    picture = Picture(rendering.rgb, rendering.depth, state.camera)
-    return Observation(picture, RobotState(hands.pose, hands.gripper_open))
+def _observation(pictures: Picture[Array], hands: EndEffectors) -> Observation:
+    return Observation(pictures, RobotState(hands.pose, hands.gripper_open))
 
 
 def _plan(scene: Scene, ctrl: Array, action: Action) -> controller.Plan:
@@ -227,7 +229,8 @@ class Environment:
 
     task: a Task or its name. physics: "mujoco" (C, for CPUs) or "mjx" (accelerators, jitted throughout). To step inside
         a larger jitted program, pass ``environment.physics`` to it and call `step` with ``environment.scene``.
-    image_size: height and width of the pictures, pixels. cameras: those of `observe_cameras`, see `sim/cameras.py`.
+    image_size: height and width of the pictures, pixels. cameras: names of those that `observe` looks through, see
+        `sim/cameras.py`.
     shifts: which of ``shifts.SHIFTS`` make the episodes unlike those of training.
     Raises UserError if JAX's settings would draw other episodes from the same seeds.
     """
@@ -256,7 +259,7 @@ class Environment:
         self._step = jit_with_mjx(transition) if self.physics.traceable else transition
         self._place = jax.jit(functools.partial(place, self.scene))
         self._render = jax.jit(render)
-        self._observe_cameras = jax.jit(functools.partial(observe_cameras, self.scene), static_argnums=1)
+        self._take_pictures = jax.jit(functools.partial(take_pictures, self.scene), static_argnums=1)
         self._end_effectors = jax.jit(functools.partial(end_effectors, self.scene))
         self._taken = jax.jit(functools.partial(taken, self.scene))
         self._keypoints = jax.jit(jax.vmap(lambda state: self.task.keypoints(self.view(state))))
@@ -290,12 +293,10 @@ class Environment:
         return states
 
     def observe(self, state: SimState) -> Observation:
-        """Returns what a policy sees, see `observe`. The pictures are those of `render`: one program makes both."""
-        return _observation(self.render(state), self.end_effector(state), state)
-
-    def observe_cameras(self, state: SimState) -> CameraViews:
-        """Draws what each of ``self.cameras`` sees, stacked on a camera axis."""
-        return self._observe_cameras(self.renderer, self.cameras, state)
+        """Returns what a policy sees with ``self.cameras``, see `observe`."""
+        # One program draws the front camera's picture and its segmentation.
+        front = self.render(state) if FRONT in self.cameras else None
+        return _observation(self._take_pictures(self.renderer, self.cameras, state, front), self.end_effector(state))
 
     def render(self, state: SimState) -> Rendering:
         """Draws colour, depth and segmentation of the front camera."""

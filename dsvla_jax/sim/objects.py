@@ -7,6 +7,7 @@ import numpy as np
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
+from dsvla_jax.sim.rendering import Rendering
 from dsvla_jax.sim.tasks.task import fill
 
 
@@ -34,9 +35,12 @@ def object_geoms(environment: Environment, variation: int) -> list[list[int]]:
     return found
 
 
-def object_masks(environment: Environment, state: SimState) -> np.ndarray:
-    """bool (B, K, H, W): the visible pixels of the K objects of the environment's task, in the order of `objects`."""
-    segmentation = np.asarray(environment.render(state).segmentation)
+def object_masks(environment: Environment, state: SimState, seen: Rendering) -> np.ndarray:
+    """bool (B, K, H, W): the visible pixels of the K objects of the environment's task, in the order of `objects`.
+
+    seen: what `Environment.render` drew of the state.
+    """
+    segmentation = np.asarray(seen.segmentation)
     return np.array(
         [
             [np.isin(shown, geoms) for geoms in object_geoms(environment, variation)]

@@ -4,7 +4,8 @@ import jax
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, OptimizerConfig
-from dsvla_jax.sim.tasks import select_tasks
+from dsvla_jax.sim.cameras import check_cameras
+from dsvla_jax.sim.tasks import get_task, select_tasks
 
 
 def require_possible(experiment: Experiment) -> None:
@@ -24,9 +25,10 @@ def require_possible(experiment: Experiment) -> None:
                 "holds all weights; set it to 0, use --validate-every, and evaluate checkpoints beside the job: python "
                 "eval.py RUN"
             )
-        select_tasks(experiment.data.tasks)
+        for task in select_tasks(experiment.data.tasks):
+            check_cameras(experiment.data.cameras, get_task(task).num_arms)
         size = experiment.data.image_size
-        experiment.encoding.require_points(size, size, "a picture of data.image_size")
+        experiment.encoding.require_points(size, size, experiment.model.cameras, "a picture of data.image_size")
     if experiment.validate_every and experiment.oxe is not None:
         raise UserError(
             "validate_every: nothing is held out of Open X-Embodiment mixtures, whose displacements are binned over "

@@ -11,7 +11,14 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.experiment import OptimizerConfig
 from dsvla_jax.model.partition import constrain, shardings
-from dsvla_jax.model.variables import Regime, Variables, join_variables, narrow_frozen, split_variables
+from dsvla_jax.model.variables import (
+    CAMERA_EMBEDDING,
+    Regime,
+    Variables,
+    join_variables,
+    narrow_frozen,
+    split_variables,
+)
 from dsvla_jax.policies.interface import Learner
 from dsvla_jax.types import Array
 
@@ -59,8 +66,12 @@ def initial_state(
     Pure: `make_sharded` makes every leaf where it lives, and none of them is ever whole on one device.
     """
     variables = learner.initialise(jax.random.key(seed))
+    embedding = variables["params"].get("vision", {}).get(CAMERA_EMBEDDING)
     for collection, towers in (base or {}).items():
         variables[collection] = {**variables[collection], **towers}
+    if embedding is not None:
+        # A base that reads one camera has none.
+        variables["params"]["vision"] = {CAMERA_EMBEDDING: embedding, **variables["params"]["vision"]}
     trainable, frozen = split_variables(variables, regime)
     return start_state(trainable, optimizer, seed, average), narrow_frozen(frozen, frozen_dtype)
 

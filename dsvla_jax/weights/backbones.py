@@ -158,11 +158,17 @@ def require_base(folder: Path, model: ModelConfig) -> None:
     if is_imported(folder):
         require_same_model(folder, model)
         return
+    base = load_policy_config(folder).model
     found, expected = (
         jax.eval_shape(partial(initialize, config), jax.random.key(0))["params"]
-        for config in (load_policy_config(folder).model, model)
+        for config in (base, with_cameras_of(model, base.cameras))
     )
     require_same_shapes(found, expected, folder)
+
+
+def with_cameras_of(model: ModelConfig, cameras: int) -> ModelConfig:
+    """The model as a base that reads so many cameras has it: one of a single camera serves models of any number."""
+    return dataclasses.replace(model, cameras=1) if cameras == 1 else model
 
 
 def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -> dict[str, PyTree]:
@@ -173,7 +179,7 @@ def load_for_model(folder: Path, model: ModelConfig, mesh: Mesh, frozen: bool) -
     bits are converted one after the other. Raises CheckpointError naming the fields of the config that differ.
     """
     towers = require_same_model(folder, model)
-    full = dataclasses.replace(model, base_dtype="same")
+    full = dataclasses.replace(with_cameras_of(model, 1), base_dtype="same")
     variables = jax.eval_shape(lambda: initialize(full, jax.random.key(0)))
     like: dict[str, PyTree] = {"params": {name: variables["params"][name] for name in present_towers(towers)}}
     if towers.lora is not None:

@@ -11,7 +11,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.variables import Variables
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.policy import load_policy
-from dsvla_jax.weights.backbones import is_imported, load_for_model
+from dsvla_jax.weights.backbones import is_imported, load_for_model, with_cameras_of
 
 
 def base_variables(
@@ -34,6 +34,7 @@ def base_variables(
             f"that one: --tokenizer {folder}"
         )
     params = policy.variables["params"]
-    expected = jax.eval_shape(lambda: initialize(model, jax.random.key(0)))
+    like = with_cameras_of(model, policy.config.model.cameras)
+    expected = jax.eval_shape(lambda: initialize(like, jax.random.key(0)))
     require_same_shapes(params, expected["params"], folder)
     return {"params": params}

@@ -6,7 +6,8 @@ Each tower is a folder of its own, since PEFT adapts one model, and transformers
                     merged: config.json, model*.safetensors, tokenizer.json, tokenizer_config.json
     OUT/vision/     the same for CLIPVisionModel, or CLIPVisionModelWithProjection where the tower has the projection
     OUT/projector/  model.safetensors: the projection module, which no other format knows, by its paths in
-                    `dsvla_jax.model` (joined by dots) and in their layout, kernels (in, out)
+                    `dsvla_jax.model` (joined by dots) and in their layout, kernels (in, out); with several
+                    cameras, the vision tower's camera_embedding too
     OUT/policy.json the run's own, with every size and the encoding
 """
 
@@ -27,7 +28,7 @@ from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
 from dsvla_jax.model.config import LoraConfig, ModelConfig
 from dsvla_jax.model.lora import merge_lora, require_mergeable
-from dsvla_jax.model.variables import PROJECTOR
+from dsvla_jax.model.variables import CAMERA_EMBEDDING, PROJECTOR
 from dsvla_jax.model.vla import initialize
 from dsvla_jax.weights.imported_folder import new_folder
 from dsvla_jax.weights.readers.hugging_face import CLIP_NAMES, LLAMA_NAMES, LM_HEAD, VISUAL_PROJECTION
@@ -97,7 +98,8 @@ def _write_run(run: Path, folder: Path, model: ModelConfig, tokenizer: Tokenizer
 
     shutil.copy(run / "policy.json", folder)
     for tower in towers:
-        names, parts = _tensor_names(tower, model), {p: leaf for p, leaf in variables.items() if p[1] == tower}
+        names = _tensor_names(tower, model)
+        parts = {p: leaf for p, leaf in variables.items() if p[1] == tower and p[-1] != CAMERA_EMBEDDING}
         (folder / tower).mkdir()
         if options.merged:
             _write_model(folder / tower, parts, names, model.lora, options)
@@ -106,6 +108,7 @@ def _write_run(run: Path, folder: Path, model: ModelConfig, tokenizer: Tokenizer
             write_adapters(folder / tower, tower, parts, names, model, options.dtype, options.bases.get(tower))
     (folder / PROJECTOR).mkdir()
     projection = {".".join(p[2:]): leaf for p, leaf in variables.items() if p[:2] == ("params", PROJECTOR)}
+    projection |= {p[-1]: leaf for p, leaf in variables.items() if p[-1] == CAMERA_EMBEDDING}
     sizes = {name: leaf.size * np.dtype(options.dtype).itemsize for name, leaf in projection.items()}
     arrays = ((name, leaf.read().astype(options.dtype)) for name, leaf in projection.items())
     write_tensors(folder / PROJECTOR, sizes, arrays, options.shard_bytes)

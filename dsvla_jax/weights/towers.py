@@ -219,7 +219,7 @@ def tower_shapes(config: LanguageConfig | VisionConfig) -> dict[str, tuple[int, 
         model, inputs = Llama(ModelConfig(language=config)), ((1, 1, config.width), (1, 1), (1, 1, 1))
     else:
         model = VisionTower(ModelConfig(vision=config))
-        inputs = ((1, config.image_size, config.image_size, 3), (1, 0, config.width), (1, 0))
+        inputs = ((1, 1, config.image_size, config.image_size, 3), (1, 0, config.width), (1, 0))
     first, *rest = inputs
     arrays = jax.ShapeDtypeStruct(first, jnp.float32), *(jax.ShapeDtypeStruct(shape, jnp.int32) for shape in rest)
     return flat_shapes(jax.eval_shape(model.init, jax.random.key(0), *arrays)["params"])
