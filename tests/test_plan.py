@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.extend.core
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from dsvla_jax.encoding.config import EncodingConfig
@@ -133,7 +134,10 @@ def traced_flops(experiment: Experiment) -> int:
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     state, frozen = jax.eval_shape(partial(start_of, experiment, None, optimizer))
     step = step_of(experiment, optimizer, TARGETS)
-    return dot_flops(jax.make_jaxpr(step)(state, frozen, batches(experiment)[0]).jaxpr)
+    batch = batches(experiment)[0]
+    pictures = jax.tree.map(lambda x: np.repeat(x, experiment.model.cameras, axis=1), batch.pictures)
+    batch = dataclasses.replace(batch, pictures=pictures)
+    return dot_flops(jax.make_jaxpr(step)(state, frozen, batch).jaxpr)
 
 
 def in_16_bits(fusion: Any) -> Experiment:
