@@ -106,7 +106,7 @@ def test_index_order_has_a_patch_for_every_token(toy: Experiment):
     encoding = dataclasses.replace(toy.encoding, alignment="index_order")
     points = dataclasses.replace(encoding.points, group_sizes=(16, 5), num_points=32)
     with pytest.raises(UserError, match="at most 4 tokens at the end with alignment index_order, one a patch, got 5"):
-        dataclasses.replace(encoding, points=points)
+        dataclasses.replace(toy, encoding=dataclasses.replace(encoding, points=points))
 
 
 def test_oxe_pictures_must_have_the_points_of_the_tokenizer(toy: Experiment, tmp_path: Path):
