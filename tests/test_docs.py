@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.accelerator_page import PAGE, page
 from data_pipelines.episodes import EpisodeReader
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.environment import Environment
@@ -67,3 +68,7 @@ def test_the_example_of_own_demonstrations_works(tmp_path, monkeypatch, capsys):
 def test_linked_files_exist(page: Path):
     links = re.findall(r"\]\((?!https?:|#)([^)#]+)", page.read_text())
     assert not [link for link in links if not (page.parent / link).exists()]
+
+
+def test_the_page_of_accelerators_is_what_the_figures_say():
+    assert PAGE.read_text() == page(), "write it: python -m benchmarks.accelerator_page"
