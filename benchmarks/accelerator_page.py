@@ -42,7 +42,7 @@ def page() -> str:
     for file in sorted(RESULTS.glob("accelerator_*.json")):
         report = Report(file)
         devices = dict(flat(report.sections.get("devices", {"figures": {}})["figures"]))
-        options = " ".join(word for word in report.content["command"] if not word.startswith(("/", "--out")))
+        options = " ".join(report.content["command"])
         title = f"## {file.stem}" + (f": {devices['kind']}" if devices else "")
         command = f"python -m benchmarks.accelerator {options}"
         parts.append(f"{title}\n\n```sh\n{command}\n```\n\n```\n{table(report, headlines)}\n```\n")
