@@ -17,7 +17,7 @@ def make_pose_sampler(
 ) -> Callable[[Frame, np.random.Generator], PoseExample[np.ndarray]]:
     """``sample(frame, rng)``: varies the frame as `data` says.
 
-    words: T, the tokens that an instruction is padded to. use_keypoints: whether the policy is told the keypoint.
+    words: T, the tokens that an instruction is padded to. use_keypoints: whether the policy is given the keypoint.
     upcoming: U, keyframes to learn.
     """
 

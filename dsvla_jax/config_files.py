@@ -16,16 +16,16 @@ _converter = cattrs.Converter(forbid_extra_keys=True)
 
 
 def read_config(
-    file: Path, cls: type[Config], what: str, mend: Callable[[dict[str, Json]], None] | None = None
+    file: Path, cls: type[Config], what: str, upgrade: Callable[[dict[str, Json]], None] | None = None
 ) -> Config:
     """The config that a JSON file holds. Raises UserError naming the file and what is wrong in it.
 
-    what: what the file should be, for the message. mend: turns a map that an earlier version wrote into this version's.
+    what: what the file should be, for the message. upgrade: turns an earlier version's map into this one's.
     """
     try:
         fields = json.loads(file.read_text())
-        if mend is not None and isinstance(fields, dict):
-            mend(fields)
+        if upgrade is not None and isinstance(fields, dict):
+            upgrade(fields)
         return _converter.structure(fields, cls)
     except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
         raise UserError(f"{file}: not {what} of this version: {'; '.join(_problems(error))}") from error

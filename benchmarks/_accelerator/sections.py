@@ -29,7 +29,7 @@ class TrainCase:
 
 @dataclasses.dataclass(frozen=True)
 class DecodeCase:
-    """Actions that are measured: of so many robots, with the base in bfloat16 or in 8 bits."""
+    """Actions that are measured: for a number of robots that ask together, with the base in bfloat16 or in 8 bits."""
 
     robots: int
     base: Literal["bfloat16", "int8"] = "bfloat16"

@@ -10,7 +10,7 @@ from dsvla_jax.encoding.alignment import align_to_patches
 from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.farthest_point import farthest_point_sample
 from dsvla_jax.encoding.grammar import tokenize_answer
-from dsvla_jax.encoding.point_cloud import cloud_from_depth
+from dsvla_jax.encoding.point_cloud import joint_cloud
 from dsvla_jax.encoding.point_tokens import tokenize_points
 from dsvla_jax.encoding.prompts import format_prompt
 from dsvla_jax.encoding.text import Tokenizer
@@ -45,17 +45,9 @@ def cloud_tokens(
     Returns the tokens, their centres (metres, world frame), and the image patches that they are aligned with: each
     with a patch of the camera that its centre comes from.
     """
-    batch, cameras, height, width = pictures.depth.shape
-    config.require_points(height, width, cameras)
-    cloud = jax.vmap(
-        lambda depth, camera: cloud_from_depth(
-            depth, camera, config.workspace_low, config.workspace_high, config.stride
-        )
-    )
-    each = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (pictures.depth, pictures.camera))
-    points, valid = cloud(*each)
-    of_a_camera = points.shape[1]
-    points, valid = points.reshape(batch, -1, 3), valid.reshape(batch, -1)
+    cameras, height, width = pictures.depth.shape[1:]
+    points, valid = joint_cloud(pictures, config)
+    of_a_camera = points.shape[1] // cameras
     chosen = farthest_point_sample(points, valid, config.points.num_points)
     points = jnp.take_along_axis(points, chosen[..., None], axis=1)
     tokens, centers = jax.vmap(lambda one: tokenize_points(one, config.points))(points)

@@ -1,10 +1,13 @@
 """A depth map to the points of the workspace that are seen in it."""
 
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
 
+from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.geometry.cameras import unproject_pixels
-from dsvla_jax.types import Array, Camera
+from dsvla_jax.types import Array, Camera, Picture
 
 
 def cloud_from_depth(
@@ -36,3 +39,20 @@ def cloud_from_depth(
     low, high = jnp.array(workspace_low, jnp.float32), jnp.array(workspace_high, jnp.float32)
     inside = jnp.all((points >= low) & (points <= high), axis=-1)
     return points.reshape(-1, 3), (measured & inside).reshape(-1)
+
+
+def joint_cloud(pictures: Picture[Array], config: EncodingConfig) -> tuple[Float[Array, "b q 3"], Bool[Array, "b q"]]:
+    """Every candidate point of a batch of pictures (B, C, H, W), those of one camera after those of the other.
+
+    Returns the points (metres, world frame) and whether each is a reading inside the workspace; see `cloud_from_depth`.
+    """
+    batch, cameras, height, width = pictures.depth.shape
+    config.require_points(height, width, cameras)
+    cloud = jax.vmap(
+        lambda depth, camera: cloud_from_depth(
+            depth, camera, config.workspace_low, config.workspace_high, config.stride
+        )
+    )
+    each = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (pictures.depth, pictures.camera))
+    points, valid = cloud(*each)
+    return points.reshape(batch, -1, 3), valid.reshape(batch, -1)

@@ -1,6 +1,7 @@
 """Compiles the training step and the decoding step for a slice of chips, and says what they would take there."""
 
 import dataclasses
+import functools
 import math
 import re
 import time
@@ -63,8 +64,13 @@ def planning_tokenizer(experiment: Experiment) -> Tokenizer:
 
     An integer of the small one is one token. Nothing but the few numbers of an answer depends on it.
     """
-    folder = Path(experiment.tokenizer)
-    return load_tokenizer(folder) if experiment.tokenizer and folder.exists() else WordTokenizer(vocabulary(()))
+    return _vocabulary(Path(experiment.tokenizer).resolve() if experiment.tokenizer else None)
+
+
+# It can take seconds to read, and every mesh that is tried asks for the shapes of a state.
+@functools.cache
+def _vocabulary(folder: Path | None) -> Tokenizer:
+    return load_tokenizer(folder) if folder is not None and folder.exists() else WordTokenizer(vocabulary(()))
 
 
 def planning_learner(experiment: Experiment) -> Learner[Any, Any]:

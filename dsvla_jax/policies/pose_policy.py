@@ -140,8 +140,15 @@ class PosePolicy:
         self, instruction: str, robot: RobotState[np.ndarray], keypoints: Float[np.ndarray, "a 3"] | None
     ) -> Text[np.ndarray]:
         """See `Policy`: the instruction; state and keypoints are read as numbers."""
-        require_known_words(instruction, self.tokenizer)
-        return encode_instruction(self.tokenizer, instruction, self.config.encoding.max_text_length)
+        return jax.tree.map(lambda rows: rows[0], self.encode_words([instruction]))
+
+    def encode_words(self, instructions: Sequence[str]) -> Text[np.ndarray]:
+        """Encodes the instructions of a batch. Raises UserError as `encode_prompt` does."""
+        for text in instructions:
+            require_known_words(text, self.tokenizer)
+        length = self.config.encoding.max_text_length
+        encoded = [encode_instruction(self.tokenizer, text, length) for text in instructions]
+        return jax.tree.map(lambda *rows: np.stack(rows), *encoded)
 
     def act(
         self, observation: Observation, instructions: Sequence[str], keypoints: np.ndarray | None
@@ -161,8 +168,7 @@ class PosePolicy:
         """See `Policy`. key: for policies that sample; the same answer each time without one."""
         size, arms = len(instructions), observation.robot.pose.shape[1]
         robot = jax.tree.map(np.asarray, observation.robot)
-        encoded = [self.encode_prompt(text, robot, None) for text in instructions]
-        words = jax.tree.map(lambda *rows: np.stack(rows), *encoded)
+        words = self.encode_words(instructions)
         near = None
         if keypoints is not None and self.config.wants_keypoints:
             near = np.asarray(keypoints, np.float32)
@@ -192,9 +198,7 @@ class PoseOnDevice:
 
     def ask(self, instructions: Sequence[str]) -> Text[Array]:
         """See `DevicePolicy`."""
-        blank = RobotState(np.zeros((self.arms, 7), np.float32), np.zeros(self.arms, np.float32))
-        encoded = [self.policy.encode_prompt(text, blank, None) for text in instructions]
-        return jax.tree.map(lambda *rows: jnp.stack(rows), *encoded)
+        return jax.tree.map(jnp.asarray, self.policy.encode_words(instructions))
 
     def act(
         self,
