@@ -189,8 +189,8 @@ class EpisodeReader:
     Episodes and frames are numbered through all shards, task by task, in the order in which they were written.
     `num_arms` is by task, `instructions` are those of the shards, `cameras` the names of the cameras.
     tasks: which tasks, none twice; all if None. episodes: only the first of each task, this many; all if None. skip:
-    leaves this many out before them. `fewer`: whether a task may have fewer. cameras: whose pictures to give, and in which
-    order; all if None. "front" also stands for the only camera of a folder, whatever its name.
+    leaves this many out before them. `fewer`: whether a task may have fewer. cameras: whose pictures to give, and in
+    which order; all if None. "front" also stands for the only camera of a folder, whatever its name.
     """
 
     def __init__(
