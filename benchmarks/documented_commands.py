@@ -65,7 +65,7 @@ OWN = {
 TOY_RECORDINGS = """
 from pathlib import Path
 from tests.rlbench_files import write_dataset
-write_dataset(Path("toy/rlbench"), ["lamp_on"], size=96, descriptions=["turn on the light"])
+write_dataset(Path("toy/rlbench"), ["lamp_on"], size=96, descriptions=["turn on the light"], cameras=["front", "wrist"])
 """
 ORIGINAL = {f"SRC{suffix}": f"tests/golden/original/{file}" for suffix, file in (("", "llama"), ("2", "clip.pt"))}
 
@@ -93,6 +93,7 @@ RULES = (
     Rule("eval.py runs/all", f"--episodes 1 --tasks {TASKS}"),
     Rule("eval.py .*--step best", "--episodes 1 --tasks lamp_on", {"RUN": "runs/validated"}),
     Rule("eval.py", "--episodes 1 --tasks lamp_on", OWN),
+    Rule("data_pipelines.demos .*--cameras", "--episodes 4"),
     Rule("data_pipelines.demos", f"--episodes 4 --tasks {TASKS}"),
     Rule("data_pipelines.find_keypoints|--perception", only_parsed="needs PyTorch and weights from a hub"),
     Rule("data_pipelines", words=OWN),

@@ -109,17 +109,21 @@ def write_episode(
     frames=40,
     protocol=4,
     descriptions=("pick up the red box", "lift the red box"),
+    cameras=("front",),
     change=None,
     demo_change=None,
 ):
-    """One episode folder. change(number, fields of each arm, other fields) and demo_change(observations) alter what is
-    pickled."""
+    """One episode folder, whose cameras are all in one place.
+
+    change(number, fields of each arm, other fields) and demo_change(observations) alter what is pickled.
+    """
     pose, gripper, velocity = trajectory(frames, arms)
     rgb, depth = render(size)
     colour, distance = ("rgb_{:04d}.png", "depth_{:04d}.png") if arms == 2 else ("{}.png", "{}.png")
     for i in range(frames):
-        save_png(folder / "front_rgb" / colour.format(i), rgb)
-        save_png(folder / "front_depth" / distance.format(i), pack_depth(depth))
+        for camera in cameras:
+            save_png(folder / f"{camera}_rgb" / colour.format(i), rgb)
+            save_png(folder / f"{camera}_depth" / distance.format(i), pack_depth(depth))
     with _Fakes() as fakes:
         observations = []
         for i in range(frames):
@@ -136,14 +140,15 @@ def write_episode(
             rest = {
                 "front_rgb": None,
                 "task_low_dim_state": np.array([]),
-                "misc": {
-                    "front_camera_extrinsics": CAMERA.copy(),
-                    "front_camera_intrinsics": intrinsics(size),
-                    "front_camera_near": NEAR,
-                    "front_camera_far": np.float64(FAR),
-                    "variation_index": 0,
-                },
+                "misc": {"variation_index": 0},
             }
+            for camera in cameras:
+                rest["misc"] |= {
+                    f"{camera}_camera_extrinsics": CAMERA.copy(),
+                    f"{camera}_camera_intrinsics": intrinsics(size),
+                    f"{camera}_camera_near": NEAR,
+                    f"{camera}_camera_far": np.float64(FAR),
+                }
             if change:
                 change(i, felt, rest)
             if arms == 2:

@@ -59,14 +59,14 @@ def test_a_camera_that_stands_still_and_sees_no_keypoint_is_refused_with_the_way
         rest["misc"]["front_camera_extrinsics"] = files.CAMERA @ np.diag([1, -1, -1, 1.0])
 
     source = write_source(tmp_path / "source", look_away)
-    with pytest.raises(DataError, match=r"episode0: keypoints.*choose another --camera, or import without keypoints"):
+    with pytest.raises(DataError, match=r"episode0: keypoints.*choose another --cameras, or import without keypoints"):
         import_demonstrations(source, tmp_path / "out", Settings(), progress=False)
     assert len(imported(source, tmp_path / "out", keypoints="none")) == 1
 
 
 def test_a_camera_that_is_not_there_is_answered_by_those_that_are(tmp_path):
     source = write_source(tmp_path / "source", on_the_wrist)
-    with pytest.raises(DataError, match=r"camera: expected one of front, wrist, got 'wirst'; choose one with --camera"):
+    with pytest.raises(DataError, match=r"camera: expected one of front, wrist, got 'wirst'; choose one with --cameras"):
         import_demonstrations(source, tmp_path / "out", Settings(cameras=("wirst",)), progress=False)
     with pytest.raises(
         DataError, match=r"wrist_rgb: folder: expected 40 pictures, got none, but those of front; choose"

@@ -106,7 +106,7 @@ def import_episode(folder: Path, task: str, number: int, settings: Settings) -> 
         recording = dataclasses.replace(recording, keypoints=points)
     keyframes = discover_keyframes(recording.gripper_open, joint_velocities, settings.still, settings.stop_buffer)
     fix = (
-        "this camera does not see where the grippers act: choose another --camera, or import without keypoints "
+        "this camera does not see where the grippers act: choose another --cameras, or import without keypoints "
         "(--keypoints none); if it should see it, its matrix is wrong"
     )
     samples = sample_starts(keyframes, settings.every_n)

@@ -138,7 +138,7 @@ def _check_camera_name(camera: str, misc: object, path: Path) -> None:
     names = [str(name) for name in misc] if isinstance(misc, dict) else []
     cameras = sorted(name.removesuffix(ending) for name in names if name.endswith(ending))
     if cameras and not any(name.startswith(f"{camera}_camera_") for name in names):
-        raise DataError(path, "camera", f"one of {', '.join(cameras)}", repr(camera), "choose one with --camera")
+        raise DataError(path, "camera", f"one of {', '.join(cameras)}", repr(camera), "choose one with --cameras")
 
 
 def _field(record: object, name: str, number: int, path: Path) -> object:
@@ -200,7 +200,7 @@ class _Pictures(Sequence[np.ndarray]):
             kind = name.rsplit("_", 1)[1]
             others = sorted({path.parent.name.removesuffix(f"_{kind}") for path in folder.glob(f"*_{kind}/[!.]*.png")})
             got = f"none, but those of {', '.join(others)}" if others else "none"
-            fix = f"choose one of these with --camera, or {_FIX}" if others else _FIX
+            fix = f"choose one of these with --cameras, or {_FIX}" if others else _FIX
             raise DataError(self.folder, "folder", f"{count} pictures", got, fix)
         digits = ["".join(c for c in file if c.isdigit()) for file in files]
         self.names = {int(number): file for number, file in zip(digits, files, strict=True) if number}
