@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 import train
 from data_pipelines.oxe.fixtures.write import write_fixture
+from data_pipelines.preparation import prepare
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.data_config import OxeConfig
 from dsvla_jax.errors import UserError
@@ -85,9 +86,9 @@ def from_settings(experiment: Experiment, group: Group, run: Path, traced: bool)
     """What becomes of values before anything is written; empty if they pass. traced: whether shapes are asked too."""
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            prepared, _, mesh, _, picture = train.prepare(with_all(experiment, group), run)
+            prepared = prepare(with_all(experiment, group), run)
             if traced:
-                check_step(prepared, mesh, picture)
+                check_step(prepared.experiment, prepared.mesh, prepared.picture)
     except UserError:
         return REFUSED
     except Exception:

@@ -118,7 +118,23 @@ class EvaluationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class Experiment:
+class Schedule:
+    """How long a run trains, and what it does on the way."""
+
+    steps: int = 1000
+    """Training steps."""
+    batch_size: int = 32
+    """Examples a step, over all devices."""
+    log_every: int = 20
+    """Steps after which the numbers of a step are written, and at the end; 0 for the end alone."""
+    checkpoint_every: int = 250
+    """Steps after which a checkpoint is written, and at the end; 0 for the end alone."""
+    max_skipped_steps: int = 10
+    """Steps whose loss or gradient is not finite are skipped; a run with more of them stops."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Experiment(Schedule):
     """Everything that decides the outcome of a run."""
 
     encoding: EncodingConfig
@@ -144,10 +160,6 @@ class Experiment:
     ones: the frozen base of the `lora` regime. Empty: all are random from the seed."""
     tokenizer: str = ""
     """A folder with the language model's vocabulary; empty: the words of the task suite."""
-    steps: int = 1000
-    """Training steps."""
-    batch_size: int = 32
-    """Examples a step, over all devices."""
     gradient_accumulation: int = 1
     """Parts in which a batch is computed, one after the other: less memory, the same step."""
     mesh: MeshConfig = dataclasses.field(default_factory=MeshConfig)
@@ -159,18 +171,12 @@ class Experiment:
     """Bins: the width of the Gaussian that replaces one-hot targets on numbers; 0 is the paper's cross-entropy."""
     seed: int = 0
     """Seed of the initial parameters, the order of the data and all noise."""
-    log_every: int = 20
-    """Steps after which the numbers of a step are written, and at the end; 0 for the end alone."""
     validate_every: int = 0
     """Steps after which answers are compared with held-out demonstrations, and at the end; 0 for never."""
     evaluate_every: int = 0
     """Steps after which the policy acts in episodes of the training tasks, and at the end; 0 for never."""
-    checkpoint_every: int = 250
-    """Steps after which a checkpoint is written, and at the end; 0 for the end alone."""
     keep_checkpoints: int = 2
     """The newest checkpoints that stay, besides the best one where steps are validated or evaluated."""
-    max_skipped_steps: int = 10
-    """Steps whose loss or gradient is not finite are skipped; a run with more of them stops."""
 
     @property
     def keypoints(self) -> Literal["oracle", "segmentation"]:
@@ -183,15 +189,15 @@ class Experiment:
             "",
             steps=at_least(1),
             batch_size=at_least(1),
+            log_every=at_least(0),
+            checkpoint_every=at_least(0),
+            max_skipped_steps=at_least(0),
             gradient_accumulation=at_least(1),
             soft_target_sigma=at_least(0),
             seed=at_least(0),
-            log_every=at_least(0),
             validate_every=at_least(0),
             evaluate_every=at_least(0),
-            checkpoint_every=at_least(0),
             keep_checkpoints=at_least(1),
-            max_skipped_steps=at_least(0),
         )
         if self.oxe is not None:
             require(bool(self.oxe.mixture), "oxe.mixture", "a named mixture or names of datasets", self.oxe.mixture)

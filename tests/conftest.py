@@ -1,11 +1,11 @@
 """One persistent compilation cache for the whole suite: what a test compiles once, no later run compiles again.
 
-Tests spend most of their time compiling, so XLA leaves most optimisations out here. The programs that tests start in
-processes of their own are compiled as a user's.
+Tests spend most of their time compiling, so XLA leaves most optimisations out, here and in programs that tests start.
 
 And run-time checks of types and shapes: of what the structs hold, and of what the functions around them take and give.
 """
 
+import os
 from pathlib import Path
 
 import jax
@@ -21,3 +21,4 @@ jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_disable_most_optimizations", True)
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"

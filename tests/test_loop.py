@@ -82,14 +82,12 @@ def train(
         return compiled_step()(state, {}, batch)
 
     with closing(RunCheckpoints(run)) as checkpoints:
-        if checkpoints.latest_step is not None:
-            restored = checkpoints.restore(loop.arrays_of(state))
-            state = loop.state_of(restored)
-            batches.set_state(restored.notes.iterator)
+        state, _ = loop.resume(checkpoints, state, {}, batches)
         with MetricsWriter(run, int(state.step)) as metrics:
             return loop.train(
                 experiment,
                 run,
+                regime=experiment.regime,
                 state=state,
                 step=step,
                 batches=batches,

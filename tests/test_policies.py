@@ -24,7 +24,7 @@ from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.policies.config import Baseline, BehaviourCloningConfig, DP3Config, PolicyConfig
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
-from dsvla_jax.policies.dp3 import PointEncoder
+from dsvla_jax.policies.dp3 import Convolution, PointEncoder
 from dsvla_jax.policies.pose_vectors import center, from_vectors, to_vectors
 from dsvla_jax.policies.registry import make_learner, make_policy
 from dsvla_jax.policy import load_policy, save_policy_config
@@ -200,6 +200,18 @@ def test_the_points_order_does_not_matter_to_dp3():
     shuffled = points[:, jax.random.permutation(jax.random.key(2), 40)]
     one, other = (np.asarray(encoder.apply(variables, x)) for x in (points, shuffled))
     np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+@pytest.mark.parametrize("length", [1, 2, 4, 7])
+@pytest.mark.parametrize(("kernel", "stride"), [(5, 1), (3, 1), (3, 2)])
+def test_a_convolution_over_few_keyframes_is_xlas(length: int, kernel: int, stride: int):
+    x = jax.random.normal(jax.random.key(0), (3, length, 4))
+    convolution = Convolution(6, kernel, stride)
+    variables = convolution.init(jax.random.key(1), x)
+    weights = variables["params"]["kernel"]
+    padding, order = [(kernel // 2, kernel // 2)], ("NWC", "WIO", "NWC")
+    expected = jax.lax.conv_general_dilated(x, weights, (stride,), padding, dimension_numbers=order)
+    np.testing.assert_allclose(convolution.apply(variables, x), expected, atol=1e-5)
 
 
 def train(baseline: Baseline, batch: PoseExample[np.ndarray], steps: int, rate: float) -> tuple[Any, TrainState]:

@@ -13,6 +13,7 @@ import pytest
 
 import train
 from configs import config_names, get_config
+from data_pipelines.preparation import prepare
 from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.checkpoints.storage import CheckpointError
 from dsvla_jax.data_config import DataConfig, OxeConfig
@@ -44,7 +45,7 @@ def test_every_field_of_every_config_takes_an_odd_value_or_says_why_not(toy: Exp
             asked += 1
             # All else than a UserError would be a traceback.
             with contextlib.suppress(UserError):
-                train.prepare(odd.apply(experiment), tmp_path / "run")
+                prepare(odd.apply(experiment), tmp_path / "run")
     assert asked > 1000
     assert not (tmp_path / "run").exists()
 
@@ -82,7 +83,7 @@ def test_no_size_or_rate_is_zero_negative_or_not_a_number(toy: Experiment, value
 )
 def test_settings_that_contradict_one_another_name_both(toy: Experiment, name: str, value, message, tmp_path: Path):
     with pytest.raises(UserError, match=message):
-        train.prepare(OddSetting(name, value).apply(toy), tmp_path / "run")
+        prepare(OddSetting(name, value).apply(toy), tmp_path / "run")
 
 
 @pytest.mark.parametrize(
@@ -112,7 +113,7 @@ def test_index_order_has_a_patch_for_every_token(toy: Experiment):
 def test_oxe_pictures_must_have_the_points_of_the_tokenizer(toy: Experiment, tmp_path: Path):
     experiment = dataclasses.replace(toy, oxe=OxeConfig(image_size=8), validate_every=0)
     with pytest.raises(UserError, match=r"expected at most the 16 points of a picture of oxe.image_size of 8 x 8"):
-        train.prepare(experiment, tmp_path / "run")
+        prepare(experiment, tmp_path / "run")
 
 
 def test_what_no_machine_can_hold_is_refused_before_it_is_allocated(toy: Experiment):
@@ -135,7 +136,7 @@ def test_zero_means_never_for_all_that_is_done_every_so_many_steps(toy: Experime
 def test_unlimited_gradients_and_short_runs_stay_possible(toy: Experiment, tmp_path: Path):
     optimizer = OptimizerConfig(gradient_clip=math.inf)
     assert optimizer.warmup_steps > toy.steps
-    train.prepare(dataclasses.replace(toy, optimizer=optimizer), tmp_path / "run")
+    prepare(dataclasses.replace(toy, optimizer=optimizer), tmp_path / "run")
 
 
 def test_a_policy_of_contradicting_sizes_does_not_load(toy: Experiment, tmp_path: Path):

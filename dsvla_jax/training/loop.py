@@ -11,7 +11,8 @@ import jax
 from tqdm import tqdm
 
 from dsvla_jax.checkpoints.run import Arrays, Notes, Restored, RunCheckpoints
-from dsvla_jax.experiment import Experiment
+from dsvla_jax.experiment import Schedule
+from dsvla_jax.model.variables import Regime, Variables
 from dsvla_jax.policies.interface import Learner
 from dsvla_jax.training.chips import peak_flops
 from dsvla_jax.training.health import Clock, SkippedSteps, memory
@@ -52,9 +53,10 @@ def is_due(step: int, every: int) -> bool:
 
 
 def train(
-    experiment: Experiment,
+    schedule: Schedule,
     run: Path,
     *,
+    regime: Regime,
     state: TrainState,
     step: Step,
     batches: Batches,
@@ -64,8 +66,9 @@ def train(
     checks: Sequence[PeriodicEval] = (),
     note: Callable[[str], None] = lambda doing: None,
 ) -> signal.Signals | None:
-    """Trains from the state's step to the experiment's last, saving on the way and at the end.
+    """Trains from the state's step to the schedule's last, saving on the way and at the end.
 
+    regime: what is trained of the policy's variables.
     step: trains on this process's part of a batch; may consume the state that it is given.
     learner: of the policy that is trained, for what is counted and shown.
     checks: a step that their figures give a score (`score_of`) is saved, and its checkpoint carries the score.
@@ -75,13 +78,13 @@ def train(
     """
     first = done = int(state.step)
     name, words = learner.progress
-    clock = Clock(learner.flops(experiment.regime), peak_flops(jax.devices()))
-    skipped = SkippedSteps(run / "skipped", experiment.max_skipped_steps, int(state.skipped))
-    bar = tqdm(total=experiment.steps, initial=first, unit="step", desc="train", disable=jax.process_index() > 0)
+    clock = Clock(learner.flops(regime), peak_flops(jax.devices()))
+    skipped = SkippedSteps(run / "skipped", schedule.max_skipped_steps, int(state.skipped))
+    bar = tqdm(total=schedule.steps, initial=first, unit="step", desc="train", disable=jax.process_index() > 0)
     stop: signal.Signals | None = None
     with bar, StopRequest() as request:
         bar.set_postfix_str("compiling the training step")
-        for done in range(first + 1, experiment.steps + 1):
+        for done in range(first + 1, schedule.steps + 1):
             note(f"reading data for step {done}")
             with clock.waiting():
                 batch = next(batches)
@@ -94,9 +97,9 @@ def train(
                 bar.set_postfix_str("")
                 clock.start()
             else:
-                clock.count(experiment.batch_size, learner.tokens(batch) * jax.process_count())
+                clock.count(schedule.batch_size, learner.tokens(batch) * jax.process_count())
             figures: dict[str, float] = {}
-            if is_due(done, experiment.log_every) or done == experiment.steps:
+            if is_due(done, schedule.log_every) or done == schedule.steps:
                 numbers = {figure: float(value) for figure, value in values.items()}
                 figures = {**numbers, **clock.read(), **memory()}
                 shown = f", {words} {numbers[name]:.2f}" if name in numbers else ""
@@ -104,7 +107,7 @@ def train(
                 checkpoints.raise_if_failed()
             for check in checks:
                 # Whoever asks to stop is not kept waiting.
-                if check.is_due(done, experiment.steps) and not request.noted:
+                if check.is_due(done, schedule.steps) and not request.noted:
                     note(f"{check.name} step {done}")
                     bar.set_postfix_str(check.name)
                     jax.block_until_ready(values)
@@ -113,17 +116,33 @@ def train(
             if figures:
                 metrics.write(done, figures)
             stop, score = request.after(done), score_of(figures)
-            last = done == experiment.steps or stop is not None
-            if is_due(done, experiment.checkpoint_every) or last or score is not None:
+            last = done == schedule.steps or stop is not None
+            if is_due(done, schedule.checkpoint_every) or last or score is not None:
                 skipped.settle()
                 metrics.sync()
                 with clock.paused():
-                    checkpoints.save(done, arrays_of(state), notes_of(experiment, batches), score)
+                    checkpoints.save(done, arrays_of(state), notes_of(schedule, batches), score)
             if stop is not None:
                 bar.set_postfix_str(f"{stop.name}: saving step {done}")
                 break
     checkpoints.wait()
-    return stop if done < experiment.steps else None
+    return stop if done < schedule.steps else None
+
+
+def resume(
+    checkpoints: RunCheckpoints, state: TrainState, frozen: Variables, batches: Batches
+) -> tuple[TrainState, Variables]:
+    """Goes on from the newest checkpoint, batches included; saves the frozen variables where there is none.
+
+    Returns the state and the frozen variables to train with. Raises CheckpointError for checkpoints that do not fit.
+    """
+    if checkpoints.latest_step is None:
+        checkpoints.save_base(frozen)
+        return state, frozen
+    frozen = checkpoints.restore_base(frozen)
+    restored = checkpoints.restore(arrays_of(state))
+    batches.set_state(restored.notes.iterator)
+    return state_of(restored), frozen
 
 
 def score_of(figures: Mapping[str, float]) -> float | None:
@@ -144,9 +163,9 @@ def arrays_of(state: TrainState) -> Arrays:
     return Arrays(state.trainable, state.optimizer, counters, {"key": state.rng}, state.average or {})
 
 
-def notes_of(experiment: Experiment, batches: Batches) -> Notes:
+def notes_of(schedule: Schedule, batches: Batches) -> Notes:
     """What a checkpoint keeps besides arrays."""
-    return Notes(iterator=batches.get_state(), config=dataclasses.asdict(experiment))
+    return Notes(iterator=batches.get_state(), config=dataclasses.asdict(schedule))
 
 
 def state_of(restored: Restored) -> TrainState:
