@@ -67,7 +67,8 @@ from pathlib import Path
 from tests.rlbench_files import write_dataset
 write_dataset(Path("toy/rlbench"), ["lamp_on"], size=96, descriptions=["turn on the light"], cameras=["front", "wrist"])
 """
-ORIGINAL = {f"SRC{suffix}": f"tests/golden/original/{file}" for suffix, file in (("", "llama"), ("2", "clip.pt"))}
+GOLDEN = "tests/golden/original"
+ORIGINAL = {"SRC": f"{GOLDEN}/llama", "SRC2": f"{GOLDEN}/clip.pt", "OUT": "bases/mine"}
 
 RULES = (
     Rule("^make train", f'TRAIN_OPTIONS="{TRAIN}" EVAL_OPTIONS="--episodes 1"'),
@@ -97,7 +98,8 @@ RULES = (
     Rule("data_pipelines.demos", f"--episodes 4 --tasks {TASKS}"),
     Rule("data_pipelines.find_keypoints|--perception", only_parsed="needs PyTorch and weights from a hub"),
     Rule("data_pipelines", words=OWN),
-    Rule("weights import SRC", words={"OUT": "bases/mine", "FILE": "tests/golden/original/adapter.pth", **ORIGINAL}),
+    Rule("weights import .*--adapter-heads", "--adapter-heads 3", {**ORIGINAL, "FILE": f"{GOLDEN}/adapter.pth"}),
+    Rule("weights import SRC", words=ORIGINAL),
     Rule("weights import", words=OWN),
     Rule("weights export", words={"RUN": "runs/tiny_lora", "runs/paper_7b": "runs/tiny_lora", "OUT": "exports/run"}),
     Rule("plan.py .*--search", "--topology v5e:2x2"),

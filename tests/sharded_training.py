@@ -57,7 +57,12 @@ def tiny_experiment(fusion: Any = "prefix", points: bool = True, **changes: Any)
         remat="none",
     )
     experiment = Experiment(
-        encoding, model, optimizer=OptimizerConfig(learning_rate=1e-3), regime="lora", steps=20, batch_size=16
+        encoding=encoding,
+        model=model,
+        optimizer=OptimizerConfig(learning_rate=1e-3),
+        regime="lora",
+        steps=20,
+        batch_size=16,
     )
     return dataclasses.replace(experiment, **changes)
 

@@ -32,8 +32,8 @@ from train import advice
 
 TOKENIZER = suite_tokenizer()
 EXPERIMENT = Experiment(
-    small_encoding(max_text_length=64),
-    ModelConfig(small_vision(), small_language(TOKENIZER.vocab_size)),
+    encoding=small_encoding(max_text_length=64),
+    model=ModelConfig(small_vision(), small_language(TOKENIZER.vocab_size)),
     data=DataConfig(tasks=("lamp_on",), image_size=32, keypoints="oracle"),
 )
 OLD = [

@@ -208,10 +208,10 @@ def test_a_convolution_over_few_keyframes_is_xlas(length: int, kernel: int, stri
     x = jax.random.normal(jax.random.key(0), (3, length, 4))
     convolution = Convolution(6, kernel, stride)
     variables = convolution.init(jax.random.key(1), x)
-    weights = variables["params"]["kernel"]
+    weights = jnp.asarray(variables["params"]["kernel"])
     padding, order = [(kernel // 2, kernel // 2)], ("NWC", "WIO", "NWC")
     expected = jax.lax.conv_general_dilated(x, weights, (stride,), padding, dimension_numbers=order)
-    np.testing.assert_allclose(convolution.apply(variables, x), expected, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(convolution.apply(variables, x)), expected, atol=1e-5)
 
 
 def train(baseline: Baseline, batch: PoseExample[np.ndarray], steps: int, rate: float) -> tuple[Any, TrainState]:

@@ -66,9 +66,7 @@ def test_a_camera_that_stands_still_and_sees_no_keypoint_is_refused_with_the_way
 
 def test_a_camera_that_is_not_there_is_answered_by_those_that_are(tmp_path):
     source = write_source(tmp_path / "source", on_the_wrist)
-    with pytest.raises(
-        DataError, match="expected one of front, wrist, got 'wirst'; choose one with --cameras"
-    ):
+    with pytest.raises(DataError, match="expected one of front, wrist, got 'wirst'; choose one with --cameras"):
         import_demonstrations(source, tmp_path / "out", Settings(cameras=("wirst",)), progress=False)
     with pytest.raises(
         DataError, match=r"wrist_rgb: folder: expected 40 pictures, got none, but those of front; choose"

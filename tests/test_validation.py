@@ -154,8 +154,8 @@ def small_run(folder: Path, **changes: Any) -> Experiment:
     (folder / "words").mkdir(exist_ok=True)
     save_tokenizer(tokenizer, folder / "words")
     return Experiment(
-        small_encoding(max_text_length=64),
-        ModelConfig(small_vision(), small_language(tokenizer.vocab_size)),
+        encoding=small_encoding(max_text_length=64),
+        model=ModelConfig(small_vision(), small_language(tokenizer.vocab_size)),
         data=DataConfig(source="episodes", folder=str(folder / "data"), tasks=("all",), episodes=3),
         tokenizer=str(folder / "words"),
         validation=ValidationConfig(episodes=1, batches=2),
