@@ -11,7 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from data_pipelines.pictures import random_box
+from data_pipelines.pictures import crop_intrinsics, crop_resize, random_box
 from data_pipelines.records import Frame
 from dsvla_jax.types import Picture, join_cameras, split_cameras
 
@@ -79,18 +79,11 @@ def crop(picture: Picture[np.ndarray], top: int, left: int, height: int, width: 
     inside = top >= 0 and left >= 0 and top + height <= rows and left + width <= columns
     if not inside or min(height, width) < 2:
         raise ValueError(f"crop: expected a window within {rows} x {columns}, got {(top, left, height, width)}")
-    # Corner pixels of the result are corner pixels of the window: integer indices, as in geometry.cameras.
-    scale = np.array([(width - 1) / (columns - 1), (height - 1) / (rows - 1)])
-    u, v = left + np.arange(columns) * scale[0], top + np.arange(rows) * scale[1]
-    across, down = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
-    nearest = np.ix_(np.rint(v).astype(int), np.rint(u).astype(int))
-    intrinsics = picture.camera.intrinsics.copy()
-    intrinsics[:2, 2] -= [left, top]
-    intrinsics[:2] /= scale[:, None]
+    box, size = (top, left, height, width), (rows, columns)
     return Picture(
-        rgb=cv2.remap(picture.rgb, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
-        depth=picture.depth[nearest],
-        camera=replace(picture.camera, intrinsics=intrinsics),
+        rgb=crop_resize(picture.rgb, box, size),
+        depth=crop_resize(picture.depth, box, size, nearest=True),
+        camera=replace(picture.camera, intrinsics=crop_intrinsics(picture.camera.intrinsics, box, size)),
     )
 
 

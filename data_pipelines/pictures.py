@@ -20,21 +20,22 @@ def random_box(rng: np.random.Generator, height: int, width: int, smallest: floa
     return int(rng.integers(0, height - rows + 1)), int(rng.integers(0, width - columns + 1)), rows, columns
 
 
-def crop_resize(picture: np.ndarray, box: Box, size: int, nearest: bool = False) -> np.ndarray:
-    """The box of (H, W) or (H, W, 3) as (size, size[, 3]). nearest: for depth, which must not be blended."""
+def crop_resize(picture: np.ndarray, box: Box, size: tuple[int, int], nearest: bool = False) -> np.ndarray:
+    """The box of (H, W) or (H, W, 3) in a size of (height, width). nearest: for depth, which must not be blended."""
     top, left, rows, columns = box
     part = picture[top : top + rows, left : left + columns]
-    if (rows, columns) == (size, size):
+    height, width = size
+    if (rows, columns) == size:
         return np.ascontiguousarray(part)
-    shrinks = rows > 1.5 * size or columns > 1.5 * size
+    shrinks = rows > 1.5 * height or columns > 1.5 * width
     mode = cv2.INTER_NEAREST_EXACT if nearest else cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return cv2.resize(part, (size, size), interpolation=mode)
+    return cv2.resize(part, (width, height), interpolation=mode)
 
 
-def crop_intrinsics(intrinsics: np.ndarray, box: Box, size: int) -> np.ndarray:
+def crop_intrinsics(intrinsics: np.ndarray, box: Box, size: tuple[int, int]) -> np.ndarray:
     """float32 (3, 3) of the picture that `crop_resize` makes; pixel (0, 0) is the middle of the first pixel."""
     top, left, rows, columns = box
-    across, down = size / columns, size / rows
+    down, across = size[0] / rows, size[1] / columns
     moved = np.array(
         [
             [across, 0, across * (0.5 - left) - 0.5],

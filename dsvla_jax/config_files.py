@@ -1,7 +1,7 @@
 """Configs as JSON files: frozen dataclasses in and out."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,20 +15,28 @@ Config = TypeVar("Config")
 _converter = cattrs.Converter(forbid_extra_keys=True)
 
 
-def read_config(
-    file: Path, cls: type[Config], what: str, upgrade: Callable[[dict[str, Json]], None] | None = None
-) -> Config:
-    """The config that a JSON file holds. Raises UserError naming the file and what is wrong in it.
+def read_config(file: Path, cls: type[Config], what: str) -> Config:
+    """The config that a JSON file of this or an earlier version holds.
 
-    what: what the file should be, for the message. upgrade: turns an earlier version's map into this one's.
+    what: what the file should be, for the message. Raises UserError naming the file and what is wrong in it.
     """
     try:
         fields = json.loads(file.read_text())
-        if upgrade is not None and isinstance(fields, dict):
-            upgrade(fields)
+        if isinstance(fields, dict):
+            _rename(fields)
         return _converter.structure(fields, cls)
     except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
         raise UserError(f"{file}: not {what} of this version: {'; '.join(_problems(error))}") from error
+
+
+def _rename(fields: dict[str, Json]) -> None:
+    """Turns what earlier versions called otherwise into this version's names."""
+    model, learned = fields.get("model"), fields.get("learned_from")
+    if isinstance(model, dict) and model.get("attention") == "by_hand":
+        model["attention"] = "explicit"
+    if isinstance(learned, dict) and "camera" in learned:
+        name = learned.pop("camera")
+        learned["cameras"] = [name] if name else []
 
 
 def _problems(error: Exception) -> Iterator[str]:

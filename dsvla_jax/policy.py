@@ -14,7 +14,6 @@ from dsvla_jax.config_files import read_config
 from dsvla_jax.encoding.pretrained_tokenizers import fits_rows, load_tokenizer, save_tokenizer, vocabulary_digest
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
-from dsvla_jax.json_values import Json
 from dsvla_jax.model.decode import GREEDY, Decoding
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.unstacked import unstack_layers
@@ -38,17 +37,9 @@ def load_policy_config(run: Path) -> PolicyConfig:
             f"{run}: no run here (policy.json is missing); train one: python train.py CONFIG --run {run}"
         )
     try:
-        return read_config(file, PolicyConfig, "a policy", _name_cameras)
+        return read_config(file, PolicyConfig, "a policy")
     except UserError as error:
         raise CheckpointError(f"{error}; train the run again") from error
-
-
-def _name_cameras(fields: dict[str, Json]) -> None:
-    """Turns the name of the only camera, which earlier versions kept, into names of cameras."""
-    learned = fields.get("learned_from")
-    if isinstance(learned, dict) and "camera" in learned:
-        name = learned.pop("camera")
-        learned["cameras"] = [name] if name else []
 
 
 def load_vocabulary(run: Path, config: PolicyConfig) -> Tokenizer:

@@ -70,7 +70,7 @@ def test_a_crop_keeps_every_point_at_its_place():
         for v in range(0, 64, 7):
             for u in range(0, 64, 7):
                 x, y = project(world_points(cropped)[v, u], frame)
-                np.testing.assert_allclose(cropped.pictures.rgb[0, v, u, :2], [3 * x, 3 * y], atol=1.1)
+                np.testing.assert_allclose(cropped.pictures.rgb[0, v, u, :2], [3 * x, 3 * y], atol=3 * 0.5 + 0.5)
                 assert abs(cropped.pictures.depth[0, v, u] - (1 + 0.002 * x + 0.004 * y)) < 0.5 * 0.006 + 1e-5
     assert (
         augment.random_crop(frame, np.random.default_rng(0), 1.0).pictures.camera.intrinsics.tolist()
@@ -79,12 +79,17 @@ def test_a_crop_keeps_every_point_at_its_place():
 
 
 def test_a_window_of_the_picture_is_that_window():
-    frame = smooth_frame(65)
+    frame = smooth_frame()
     (whole,) = split_cameras(frame.pictures)
-    cropped = replace(frame, pictures=join_cameras([augment.crop(whole, 10, 20, 33, 33)]))
-    np.testing.assert_array_equal(cropped.pictures.rgb[0, ::2, ::2], whole.rgb[10:43, 20:53])
-    np.testing.assert_allclose(world_points(cropped)[::2, ::2], world_points(frame)[10:43, 20:53], atol=1e-5)
-    with pytest.raises(ValueError, match="crop: expected a window within 65 x 65"):
+    cropped = augment.crop(whole, 10, 20, 32, 32)
+    twice = whole.depth[10:42, 20:52].repeat(2, axis=0).repeat(2, axis=1)
+    np.testing.assert_array_equal(cropped.depth, twice)
+    # Linear colours: the mean of the four pixels that stand for one is that pixel, but at the border.
+    means = cropped.rgb.reshape(32, 2, 32, 2, 3).astype(float).mean(axis=(1, 3))
+    np.testing.assert_allclose(means[1:-1, 1:-1], whole.rgb[11:41, 21:51], atol=0.5)
+    middle = world_points(replace(frame, pictures=join_cameras([cropped]))).reshape(32, 2, 32, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(middle, world_points(frame)[10:42, 20:52], atol=1e-5)
+    with pytest.raises(ValueError, match="crop: expected a window within 64 x 64"):
         augment.crop(whole, 40, 0, 32, 32)
 
 

@@ -36,7 +36,7 @@ def assert_close(ours, theirs):
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4 * np.abs(theirs).max())
 
 
-def run_llama(tower: Tower, tokens, positions, visible, attention: Any = "by_hand"):
+def run_llama(tower: Tower, tokens, positions, visible, attention: Any = "explicit"):
     """Hidden states and logits; visible: bool (B, T), the tokens that are not padding."""
     assert isinstance(tower.config, LanguageConfig)
     model = Llama(ModelConfig(language=tower.config, attention=attention))
@@ -53,7 +53,7 @@ def run_llama(tower: Tower, tokens, positions, visible, attention: Any = "by_han
 
 
 @pytest.mark.parametrize("name", [*LLAMAS, "llama_sharded"])
-@pytest.mark.parametrize("attention", ["by_hand", "fused"])
+@pytest.mark.parametrize("attention", ["explicit", "fused"])
 def test_llama_with_padding_on_either_side_is_that_of_transformers(folders, name, attention):
     tokens, positions, mask = (ARRAYS[f"{name}.{key}"] for key in ("tokens", "positions", "mask"))
     hidden, logits = run_llama(read_language(folders[name]), tokens, positions, mask, attention)

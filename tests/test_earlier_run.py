@@ -16,6 +16,7 @@ import eval as program
 from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.evaluation.results import read_results
 from dsvla_jax.experiment import load_experiment
+from dsvla_jax.policy import load_policy_config
 from dsvla_jax.training.loop import arrays_of, state_of
 from dsvla_jax.training.state import make_optimizer
 from tests.learning import start_of
@@ -31,6 +32,18 @@ def test_a_run_of_an_earlier_version_evaluates_to_the_same_outcomes(tmp_path: Pa
     program.main(program.Options(run, episodes=4, out=tmp_path / "again"))
     again = read_results(tmp_path / "again")
     assert again == earlier, "the same outcomes, answers and conditions, the checkpoint's digest among them"
+
+
+def test_what_earlier_versions_called_otherwise_is_read(tmp_path: Path):
+    for name in ("config.json", "policy.json"):
+        text = (RUN / name).read_text().replace('"attention": "auto"', '"attention": "by_hand"')
+        assert "by_hand" in text
+        (tmp_path / name).write_text(text)
+    assert load_experiment(tmp_path / "config.json").model.attention == "explicit"
+    config = load_policy_config(tmp_path)
+    assert config.model.attention == "explicit"
+    assert config.learned_from is not None
+    assert config.learned_from.cameras == ("front",)
 
 
 def test_training_state_of_an_earlier_version_is_restored():

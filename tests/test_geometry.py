@@ -1,12 +1,10 @@
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dsvla_jax.geometry.cameras import front_camera, make_camera, project, resize_intrinsics, unproject
+from dsvla_jax.geometry.cameras import front_camera, make_camera, project, unproject
 from dsvla_jax.geometry.rotations import (
     DOWN,
     canonical_quaternion,
@@ -59,8 +57,7 @@ def test_front_camera_golden_pixels(point, pixel, depth):
 
 def test_project_undoes_unproject_on_integer_pixels():
     height, width = 24, 40
-    camera = front_camera(40)
-    camera = dataclasses.replace(camera, intrinsics=resize_intrinsics(camera.intrinsics, (40, 40), (height, width)))
+    camera = make_camera(front_camera(40).world_from_camera, np.deg2rad(40.0), height, width)
     depth = np.random.default_rng(0).uniform(0.3, 3.0, (height, width)).astype(np.float32)
     uv, z = project(unproject(jnp.asarray(depth), camera), camera)
     u, v = np.meshgrid(np.arange(width), np.arange(height))
@@ -83,12 +80,6 @@ def test_points_in_and_behind_the_lens_stay_finite():
     uv, z = project(points, camera)
     assert np.isfinite(uv).all()
     assert (np.asarray(z) <= 0).all()
-
-
-def test_resized_intrinsics_equal_a_camera_made_at_that_size():
-    np.testing.assert_allclose(
-        resize_intrinsics(front_camera(672).intrinsics, (672, 672), (336, 336)), front_camera(336).intrinsics, rtol=1e-6
-    )
 
 
 def test_make_camera_names_a_wrong_pose_shape():

@@ -174,8 +174,8 @@ def test_a_crop_takes_the_camera_along():
     rows, columns = np.meshgrid(np.arange(96), np.arange(128), indexing="ij")
     for _ in range(20):
         box = random_box(rng, 96, 128, 0.5)
-        moved = crop_intrinsics(intrinsics, box, 64)
-        shown_rows, shown_columns = (crop_resize(x.astype(np.float32), box, 64) for x in (rows, columns))
+        moved = crop_intrinsics(intrinsics, box, (64, 64))
+        shown_rows, shown_columns = (crop_resize(x.astype(np.float32), box, (64, 64)) for x in (rows, columns))
         u, v = rng.integers(8, 56, 2)
         ray = np.linalg.inv(moved.astype(np.float64)) @ [u, v, 1]
         before = intrinsics @ ray

@@ -108,7 +108,8 @@ def write_picture(
     picture = decode_image(frame.picture, frame.format, frame.where)
     height, width = picture.shape[:2]
     box = random_box(rng, height, width, config.crop) if config.crop < 1 else (0, 0, height, width)
-    picture = crop_resize(picture, box, config.image_size)
+    size = config.image_size, config.image_size
+    picture = crop_resize(picture, box, size)
     if config.colour_variation > 0:
         vary_light(picture, rng, config.colour_variation, rgb)
     else:
@@ -120,6 +121,6 @@ def write_picture(
             fix = "only depth of the picture's own size can be used"
             raise DataError(frame.where, "depth", f"{height} x {width}", f"{counts.shape[0]} x {counts.shape[1]}", fix)
         check_depth(counts * np.float32(camera.depth_unit), frame.where)
-        depth = crop_resize(counts, box, config.image_size, nearest=True) * np.float32(camera.depth_unit)
-        intrinsics, pose = crop_intrinsics(camera.intrinsics, box, config.image_size), camera.world_from_camera
+        depth = crop_resize(counts, box, size, nearest=True) * np.float32(camera.depth_unit)
+        intrinsics, pose = crop_intrinsics(camera.intrinsics, box, size), camera.world_from_camera
     return depth, Camera(intrinsics, pose)

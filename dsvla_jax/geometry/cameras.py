@@ -97,12 +97,6 @@ def unproject_pixels(u: Array, v: Array, depth: Array, camera: Camera) -> Array:
     return jnp.einsum("ij,...j->...i", rotation, local, precision=_HIGHEST) + translation
 
 
-def resize_intrinsics(intrinsics: ArrayLike, old_size: tuple[int, int], new_size: tuple[int, int]) -> Array:
-    """The intrinsics (3, 3) of the same camera after its image was resized. Sizes are (height, width)."""
-    scale = jnp.array([new_size[1] / old_size[1], new_size[0] / old_size[0], 1.0], jnp.float32)
-    return jnp.asarray(intrinsics) * scale[:, None]
-
-
 def _matrix44(matrix: ArrayLike, name: str) -> Array:
     if jnp.shape(matrix) != (4, 4):
         raise ValueError(f"{name}: expected a (4, 4) camera-to-world matrix, got shape {jnp.shape(matrix)}")

@@ -32,8 +32,8 @@ def attend(query: Array, key: Array, value: Array, mask: Array | None = None, im
     batch, heads, length, depth = query.shape
     kv_heads = key.shape[1]
     if implementation == "auto":
-        implementation = "by_hand" if jax.default_backend() == "cpu" else "fused"
-    if implementation != "by_hand":
+        implementation = "explicit" if jax.default_backend() == "cpu" else "fused"
+    if implementation != "explicit":
         output = jax.nn.dot_product_attention(
             query.swapaxes(1, 2),
             key.swapaxes(1, 2),

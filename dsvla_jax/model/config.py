@@ -289,10 +289,10 @@ class ModelConfig:
     remat: Literal["none", "full", "dots", "dots_saveable", "dots_with_no_batch_dims_saveable"] = "none"
     """What the backward pass computes again, a layer at a time: none, full (everything), or dots (all but the products
     with weights, jax's dots_with_no_batch_dims_saveable). The other values are policies of jax.checkpoint_policies."""
-    attention: Literal["auto", "by_hand", "fused", "cudnn"] = "auto"
-    """by_hand: two batched products over head-major arrays, the fastest on CPU. fused: jax.nn.dot_product_attention as
-    XLA compiles it. cudnn: the same as one cuDNN kernel (NVIDIA, bfloat16, cuDNN's limits on lengths). auto: by_hand on
-    a CPU, fused elsewhere."""
+    attention: Literal["auto", "explicit", "fused", "cudnn"] = "auto"
+    """explicit: two batched products over head-major arrays, the fastest on CPU. fused: jax.nn.dot_product_attention as
+    XLA compiles it. cudnn: the same as one cuDNN kernel (NVIDIA, bfloat16, cuDNN's limits on lengths). auto: explicit
+    on a CPU, fused elsewhere."""
     scan_unroll: int = 1
     """Layers per iteration of the loop over layers. More layers cost compile time and save loop overhead. With all
     layers of the language model, training also skips what its last layer would compute for visual tokens."""
