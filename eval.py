@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -118,6 +118,8 @@ def main(options: Options) -> None:
         raise UserError(f"{options.run}: no run here (config.json is missing); train one: python train.py CONFIG")
     experiment = load_experiment(options.run / "config.json")
     require_simulated(experiment, options.run)
+    if experiment.baseline is not None and options.choice != "greedy":
+        raise UserError(f"--choice: {experiment.baseline.kind} answers with poses, not with integers; leave it out")
     tasks = select_tasks(options.tasks or experiment.data.tasks)
     episodes = experiment.evaluation.episodes if options.episodes is None else options.episodes
     with contextlib.closing(RunCheckpoints(options.run, read_only=True)) as checkpoints:
@@ -193,8 +195,18 @@ def compared(run: Path, options: Options) -> list[EpisodeResult]:
 
     results = latest(read_results(folder), matches)
     if not results:
-        raise UserError(f"{folder}: no results under these conditions; evaluate first: python eval.py {run}")
+        given = [f"{name} {value}" for name, value in _asked(options)]
+        command = " --".join([f"python eval.py {run}", *given])
+        raise UserError(f"{folder}: no results under these conditions; evaluate first: {command}")
     return results
+
+
+def _asked(options: Options) -> Iterator[tuple[str, str]]:
+    """The options that name other conditions than those of a plain evaluation, as on the command line."""
+    for name in ("physics", "loop", "keypoints", "keypoint_noise", "shift", "choice", "step", "seed"):
+        value, plain = getattr(options, name), getattr(Options, name)
+        if value != plain:
+            yield name.replace("_", "-"), " ".join(value) if isinstance(value, tuple) else str(value)
 
 
 def evaluate_task(

@@ -1,4 +1,4 @@
-"""Train 3DS-VLA: python train.py CONFIG [--run DIR] [--steps 500 --optimizer.learning-rate 3e-4 ...]
+"""Train a policy: python train.py CONFIG [--run DIR] [--steps 500 --optimizer.learning-rate 3e-4 ...]
 
 CONFIG is a name of configs/, or the path of a Python file of your own with a function `config() -> Experiment`.
 Demonstrations are generated first where they are missing. The run folder receives the config, the vocabulary,

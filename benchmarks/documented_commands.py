@@ -102,7 +102,7 @@ RULES = (
     Rule("weights import SRC", words=ORIGINAL),
     Rule("weights import", words=OWN),
     Rule("weights export", words={"RUN": "runs/tiny_lora", "runs/paper_7b": "runs/tiny_lora", "OUT": "exports/run"}),
-    Rule("plan.py .*--search", "--topology v5e:2x2"),
+    Rule("plan.py .*--search", "--topology v5e:2x2", {"paper_7b": "tiny_lora"}),
     Rule("plan.py .*--examples", "--examples 8 16"),
     Rule("plan.py"),
     Rule("dsvla_jax.serving", words=OWN, serves=True),

@@ -164,8 +164,8 @@ def configure_jax(physics: str = "mujoco") -> None:
             jax.config.update("jax_compilation_cache_dir", str(folder / "xla"))
         elif multiprocessing.parent_process() is None:
             print("compiled programs are not kept for the next time: no cache folder can be written", file=sys.stderr)
-    # Orbax would log every item that it reads or writes.
-    logging.getLogger("absl").setLevel(logging.WARNING)
+    # Orbax would log every item that it reads or writes, and warn of what it was asked for, such as reading only.
+    logging.getLogger("absl").setLevel(logging.ERROR)
     # A cache whose disk fills up later costs time only, and JAX would say so for every program.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

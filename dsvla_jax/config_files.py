@@ -25,8 +25,12 @@ def read_config(file: Path, cls: type[Config], what: str) -> Config:
         if isinstance(fields, dict):
             _rename(fields)
         return _converter.structure(fields, cls)
-    except (json.JSONDecodeError, cattrs.BaseValidationError) as error:
-        raise UserError(f"{file}: not {what} of this version: {'; '.join(_problems(error))}") from error
+    except json.JSONDecodeError as error:
+        raise UserError(f"{file}: not JSON, or cut short ({error}); put a copy of the file back") from error
+    except cattrs.BaseValidationError as error:
+        raise UserError(
+            f"{file}: not {what} of this version: {'; '.join(_problems(error))}; read it with the version that wrote it"
+        ) from error
 
 
 def _rename(fields: dict[str, Json]) -> None:

@@ -201,6 +201,8 @@ class Experiment(Schedule):
         )
         if self.oxe is not None:
             require(bool(self.oxe.mixture), "oxe.mixture", "a named mixture or names of datasets", self.oxe.mixture)
+        one_hot = self.soft_target_sigma == 0 or self.baseline is None
+        require(one_hot, "soft_target_sigma", "0 for a policy that answers with poses", self.soft_target_sigma)
         if uses_model(self.baseline):
             require_same_sizes(self.encoding, self.model)
             self._require_as_many_cameras()
@@ -234,14 +236,12 @@ class Experiment(Schedule):
 
     def _require_no_model(self) -> None:
         """Raises UserError for settings that a policy with a network of its own would ignore."""
-        for option, value, plain in (
-            ("model", self.model, ModelConfig()),
-            ("base", self.base, ""),
-            ("regime", self.regime, "full"),
-            ("soft_target_sigma", self.soft_target_sigma, 0.0),
-        ):
-            reads = f"nothing with baseline {self.baseline and self.baseline.kind!r}, which has a network of its own"
-            require(value == plain, option, reads, "other values than the default")
+        name = self.baseline and self.baseline.kind
+        given = [f"model.{field}" for field in _differences(self.model, ModelConfig())]
+        given += ["base"] * bool(self.base) + ["regime"] * (self.regime != "full")
+        fix = "leave it out; the number of its cameras is that of data.cameras"
+        require(not given, ", ".join(given), f"no such option for {name}, which has a network of its own", "one", fix)
+        require(self.encoding.use_points, "encoding.use_points", f"true for {name}, which sees nothing else", "false")
 
 
 # What may change when a run goes on: none of it changes what the run learns.

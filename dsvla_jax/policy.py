@@ -39,7 +39,7 @@ def load_policy_config(run: Path) -> PolicyConfig:
     try:
         return read_config(file, PolicyConfig, "a policy")
     except UserError as error:
-        raise CheckpointError(f"{error}; train the run again") from error
+        raise CheckpointError(str(error)) from error
 
 
 def load_vocabulary(run: Path, config: PolicyConfig) -> Tokenizer:

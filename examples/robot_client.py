@@ -97,6 +97,10 @@ class SimulatedRobot:
         return bool(np.asarray(self.environment.success(self._state))[0])
 
 
+def _listed(numbers: np.ndarray, digits: int) -> str:
+    return ", ".join(f"{number:.{digits}f}" for number in numbers)
+
+
 class DryRun:
     """Another robot's eyes, but no motion: says what it would do, and complains where that is far or out of bounds."""
 
@@ -112,8 +116,8 @@ class DryRun:
             distance = float(np.linalg.norm(target[:3] - now[:3]))
             inside = bool(np.all((target[:3] >= self._low) & (target[:3] <= self._high)))
             print(
-                f"  arm {arm}: to {np.round(target[:3], 3).tolist()} m, {distance:.2f} m away, quaternion "
-                f"{np.round(target[3:], 2).tolist()}, then gripper {'open' if gripper > 0.5 else 'closed'}"
+                f"  arm {arm}: to {_listed(target[:3], 3)} m, {distance:.2f} m away, "
+                f"quaternion {_listed(target[3:], 2)}, then gripper {'open' if gripper > 0.5 else 'closed'}"
                 + ("" if inside else "  OUTSIDE THE WORKSPACE")
                 + ("" if distance <= self._longest else f"  MORE THAN {self._longest} m AT ONCE")
             )

@@ -22,7 +22,7 @@ from dsvla_jax.evaluation.results import EpisodeResult, read_results, write_resu
 from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.config import BehaviourCloningConfig, PolicyConfig
 from dsvla_jax.policy import save_policy_config
 from dsvla_jax.sim.tasks import select_tasks
 from dsvla_jax.suite_vocabulary import suite_tokenizer
@@ -151,6 +151,27 @@ def test_results_written_elsewhere_are_compared(tmp_path: Path, capsys):
     assert "close_box" in printed
     with pytest.raises(UserError, match="run/eval: no results under these conditions; evaluate first"):
         program.main(program.Options(tmp_path / "run", compare=(tmp_path / "other",)))
+    with pytest.raises(UserError, match=r"python eval.py \S+run --keypoint-noise 0\.1 --shift camera position$"):
+        program.main(
+            program.Options(
+                tmp_path / "run", keypoint_noise=0.1, shift=("camera", "position"), compare=(tmp_path / "other",)
+            )
+        )
+
+
+def test_choices_between_integers_are_refused_for_policies_without_any(tmp_path: Path):
+    experiment = dataclasses.replace(EXPERIMENT, baseline=BehaviourCloningConfig())
+    run = write_run(tmp_path / "run", experiment)
+    with pytest.raises(UserError, match="--choice: behaviour_cloning answers with poses, not with integers"):
+        program.main(program.Options(run, choice="expected"))
+
+
+def test_a_damaged_line_is_named_and_costs_no_other(tmp_path: Path):
+    write_results(tmp_path, OLD[:2])
+    file = tmp_path / "results.jsonl"
+    file.write_text(file.read_text()[:-40])
+    with pytest.raises(UserError, match=r"line 2: not an episode result .*; delete that line, and evaluate its task"):
+        read_results(tmp_path)
 
 
 @pytest.mark.parametrize("main", [lambda run: program.main(program.Options(run)), lambda run: demo(DemoOptions(run))])

@@ -22,6 +22,8 @@ from dsvla_jax.model.lora import merge_lora
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.quantize import dequantize, quantize, quantize_kernel
 from dsvla_jax.model.vla import VLA, initialize
+from dsvla_jax.policies.config import BehaviourCloningConfig
+from dsvla_jax.policy import load_policy_config, save_policy_config
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.sharding import make_mesh
 from dsvla_jax.training.state import make_optimizer
@@ -266,6 +268,10 @@ def test_a_base_of_one_camera_serves_a_model_of_two(tmp_path: Path):
     np.testing.assert_array_equal(
         frozen["params"]["vision"]["positional_embedding"], base["params"]["vision"]["positional_embedding"]
     )
+    baseline = dataclasses.replace(load_policy_config(tmp_path / "base"), baseline=BehaviourCloningConfig())
+    save_policy_config(tmp_path / "base", baseline, TOKENIZER)
+    with pytest.raises(CheckpointError, match="base: a policy of behaviour_cloning; expected a run of 3DS-VLA"):
+        require_base(tmp_path / "base", model)
     write_run(tmp_path / "two", model, "full")
     with pytest.raises(CheckpointError, match="vision/camera_embedding"):
         require_base(tmp_path / "two", MODEL)

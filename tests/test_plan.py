@@ -239,8 +239,9 @@ def test_a_slice_that_is_none_is_an_error_with_an_example(name):
 
 
 @pytest.mark.slow
-def test_the_planner_plans_on_virtual_devices():
-    command = [sys.executable, "plan.py", "configs/tiny_lora.py", "--topology", "v5e:2x2"]
+@pytest.mark.parametrize("config", ["tiny_lora", "dp3"])
+def test_the_planner_plans_on_virtual_devices(config: str):
+    command = [sys.executable, "plan.py", f"configs/{config}.py", "--topology", "v5e:2x2"]
     # Without site packages' libtpu there are virtual CPU devices.
     hide = (
         "import importlib.util as u; f = u.find_spec; u.find_spec = lambda n, *a: None if n == 'libtpu' else f(n, *a)"

@@ -22,12 +22,14 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.model.config import ModelConfig
+from dsvla_jax.planner.planning import plan_decoding
 from dsvla_jax.policies.config import Baseline, BehaviourCloningConfig, DP3Config, PolicyConfig
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
 from dsvla_jax.policies.dp3 import Convolution, PointEncoder
 from dsvla_jax.policies.pose_vectors import center, from_vectors, to_vectors
 from dsvla_jax.policies.registry import make_learner, make_policy
 from dsvla_jax.policy import load_policy, save_policy_config
+from dsvla_jax.training.chips import CHIPS, Slice
 from dsvla_jax.training.loop import arrays_of, state_of
 from dsvla_jax.training.state import TrainState, average_with, initial_state, make_optimizer, make_train_step
 from dsvla_jax.types import Observation, PoseExample
@@ -193,6 +195,19 @@ def test_a_policy_answers_the_same_in_any_company_and_always(name: str):
         policy.decide(observation, ["xyzzy"] * 3, near)
 
 
+@pytest.mark.parametrize("name", BASELINES)
+def test_one_action_is_planned_as_it_is_counted(name: str):
+    experiment = Experiment(
+        encoding=ENCODING,
+        model=MODEL if name == "behaviour_cloning" else ModelConfig(),
+        baseline=BASELINES[name],
+        data=DataConfig(image_size=32),
+    )
+    where = Slice("one processor", CHIPS["v5e"], tuple(jax.devices()[:1]), virtual=True)
+    plan = plan_decoding(experiment, where, 2)
+    assert plan.flops == pytest.approx(plan.counted_flops, rel=0.05)
+
+
 def test_the_points_order_does_not_matter_to_dp3():
     points = jax.random.normal(jax.random.key(0), (2, 40, 6))
     encoder = PointEncoder((16, 32), 8)
@@ -252,13 +267,29 @@ def test_the_average_follows_the_weights_by_its_decay():
 
 def test_settings_that_a_network_of_its_own_would_ignore_are_refused():
     plain = Experiment(encoding=ENCODING, baseline=DP3Config())
-    for change, option in (
-        ({"model": MODEL}, "model"),
-        ({"base": "runs/x"}, "base"),
-        ({"soft_target_sigma": 1.0}, "soft_"),
+    for change, message in (
+        ({"model": dataclasses.replace(ModelConfig(), cameras=2)}, "model.cameras: expected no such option for dp3"),
+        ({"base": "runs/x"}, "base: expected no such option for dp3"),
+        ({"soft_target_sigma": 1.0}, "soft_target_sigma: expected 0 for a policy that answers with poses"),
+        ({"encoding": dataclasses.replace(ENCODING, use_points=False)}, "encoding.use_points: expected true for dp3"),
     ):
-        with pytest.raises(UserError, match=f"{option}.*expected nothing with baseline 'dp3'"):
+        with pytest.raises(UserError, match=message):
             dataclasses.replace(plain, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"channels": ()}, "baseline.channels: expected multiples of 8, one or more"),
+        ({"channels": (64, 63)}, "baseline.channels: expected multiples of 8"),
+        ({"point_channels": ()}, "baseline.point_channels: expected one number or more"),
+        ({"feature": 7}, "baseline.feature: expected a multiple of 4, got 7"),
+        ({"inference_steps": 101}, "baseline.inference_steps: expected at least 1, at most 100, got 101"),
+    ],
+)
+def test_sizes_that_no_network_can_have_are_refused(change: dict, message: str):
+    with pytest.raises(UserError, match=message):
+        DP3Config(**change)
 
 
 def test_a_checkpoint_keeps_the_average_and_a_policy_acts_by_it(tmp_path: Path):

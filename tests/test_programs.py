@@ -93,7 +93,7 @@ def test_a_run_of_another_config_is_not_overwritten(tmp_path: Path):
     before = (folder / "config.json").read_text()
     result = run(str(ROOT / "train.py"), "tiny", "--data.crop", "0.8", folder=tmp_path)
     assert result.returncode == 1
-    assert "started with another config (data.crop, batch_size differ)" in result.stderr
+    assert "started with another config (another batch_size, data.crop)" in result.stderr
     assert "Traceback" not in result.stderr
     assert (folder / "config.json").read_text() == before
 

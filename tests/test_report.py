@@ -174,7 +174,7 @@ def test_runs_are_compared_on_the_tasks_that_all_have():
     text = console.export_text()
     assert re.search(r"lamp_on\D+75\.0 \(30 to 95\)\D+100\.0 \(51 to 100\)", text)
     assert re.search(r"lift_ball\D+0\.0 \(0 to 79\)\D+-", text)
-    assert re.search(r"mean of the 1 tasks that all have\D+75\.0\D+100\.0", text)
+    assert re.search(r"mean of the task that all have\D+75\.0\D+100\.0", text)
 
 
 @pytest.mark.parametrize("width", [60, 100])

@@ -53,7 +53,8 @@ def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Conso
     table.add_section()
     common = set.intersection(*(set(of_run) for of_run in rates.values()))
     means = [100 * macro_mean([rate for task, rate in of_run.items() if task in common]) for of_run in rates.values()]
-    table.add_row(f"mean of the {len(common)} tasks that all have", *(f"{mean:.1f}" for mean in means))
+    tasks = "task" if len(common) == 1 else f"{len(common)} tasks"
+    table.add_row(f"mean of the {tasks} that all have", *(f"{mean:.1f}" for mean in means))
     (console or Console()).print(table)
 
 

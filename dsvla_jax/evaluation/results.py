@@ -91,7 +91,7 @@ def _read_file(file: Path) -> list[EpisodeResult]:
             results.append(EpisodeResult(**fields, conditions=conditions_from_json(conditions)))
         except (json.JSONDecodeError, TypeError, ValueError, AttributeError) as error:
             raise UserError(
-                f"{file}, line {number}: not an episode result ({error}); delete the file and evaluate again"
+                f"{file}, line {number}: not an episode result ({error}); delete that line, and evaluate its task again"
             ) from error
     return results
 

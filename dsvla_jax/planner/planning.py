@@ -18,17 +18,19 @@ from dsvla_jax.encoding.pretrained_tokenizers import load_tokenizer
 from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.decode import Decoded, decode_actions
-from dsvla_jax.model.flops import prefill_flops, training_flops
+from dsvla_jax.model.flops import prefill_flops
 from dsvla_jax.model.partition import shardings
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.hlo import program_cost
 from dsvla_jax.policies.interface import Learner
+from dsvla_jax.policies.networks import make_network
 from dsvla_jax.policies.registry import make_learner
+from dsvla_jax.policies.traced_flops import product_flops
 from dsvla_jax.training.chips import Chip, Slice
 from dsvla_jax.training.sharding import batch_part, batch_sharding, make_mesh
 from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
-from dsvla_jax.types import Array, Picture, Text
+from dsvla_jax.types import Array, Picture, PoseInputs, Text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,17 +103,19 @@ def plan_training(experiment: Experiment, where: Slice, examples: int) -> Plan:
         "optimizer": bytes_on_a_device(state.optimizer),
         "batch": bytes_on_a_device(arguments["batch"]),
     }
-    counted = sum(training_flops(experiment.encoding, experiment.model, experiment.regime).values()) * examples
+    counted = learner.flops(experiment.regime) * examples
     lowered = jit_train_step(step, state, mesh).lower(*arguments.values())
     return _plan("training step", lowered, where, mesh, examples, held, counted)
 
 
 def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
-    """Observations to actions of one arm, with so many examples a chip."""
+    """Observations to actions of one arm (of two, where a policy answers with poses), with so many examples a chip."""
     mesh = make_mesh(experiment.mesh, where.devices)
     experiment = dataclasses.replace(experiment, batch_size=examples * len(where.devices))
     batch_part(mesh, experiment.batch_size)
     state, frozen, _ = abstract_state(experiment, mesh)
+    if experiment.baseline is not None:
+        return _plan_poses(experiment, where, mesh, examples, state.trainable, frozen)
     grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
     batch = abstract_batch(experiment, mesh)
     asked = (batch.pictures, batch.text)
@@ -128,6 +132,29 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
     }
     counted = sum(prefill_flops(experiment.encoding, experiment.model).values()) * examples
     lowered = jax.jit(decode).lower(state.trainable, frozen, *asked)
+    return _plan("decoding", lowered, where, mesh, examples, held, counted)
+
+
+def _plan_poses(
+    experiment: Experiment, where: Slice, mesh: Mesh, examples: int, trainable: Variables, frozen: Variables
+) -> Plan:
+    """Observations to actions of a policy that answers with poses."""
+    assert experiment.baseline is not None
+    tokenizer = planning_tokenizer(experiment)
+    network = make_network(experiment.baseline, experiment.encoding, experiment.model, tokenizer)
+    inputs = abstract_batch(experiment, mesh).inputs
+
+    def act(trainable: Variables, frozen: Variables, inputs: PoseInputs[Array]) -> Array:
+        with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
+            return network.answer(join_variables(trainable, frozen), inputs, jax.random.key(0))
+
+    held = {
+        "frozen base": bytes_on_a_device(frozen),
+        "trainable": bytes_on_a_device(trainable),
+        "batch": bytes_on_a_device(inputs),
+    }
+    counted = product_flops(jax.make_jaxpr(act)(trainable, frozen, inputs).jaxpr) // len(where.devices)
+    lowered = jax.jit(act).lower(trainable, frozen, inputs)
     return _plan("decoding", lowered, where, mesh, examples, held, counted)
 
 

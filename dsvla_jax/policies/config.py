@@ -8,7 +8,10 @@ from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.same_sizes import require_same_sizes
-from dsvla_jax.ranges import at_least, check_fields
+from dsvla_jax.ranges import at_least, check_fields, require
+
+# Heads of the attention to words, and groups of channels that are normalised together.
+DP3_HEADS, DP3_GROUPS = 4, 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,15 +53,15 @@ class DP3Config:
     point_channels: tuple[int, ...] = (64, 128, 256)
     """Channels of the point encoder's layers, before the maximum over points."""
     feature: int = 128
-    """Channels of the points' feature, of words and of the robot's state."""
+    """Channels of the points' feature, of words and of the robot's state; a multiple of 4."""
     language_layers: int = 2
     """Layers in which the points' feature looks at the words."""
     channels: tuple[int, ...] = (128, 256, 384)
-    """Channels of the denoising network's levels."""
+    """Channels of the denoising network's levels, each a multiple of 8."""
     diffusion_steps: int = 100
     """Noise levels in training."""
     inference_steps: int = 10
-    """Denoising steps of one action."""
+    """Denoising steps of one action, at most diffusion_steps."""
 
     def __post_init__(self) -> None:
         check_fields(
@@ -70,8 +73,12 @@ class DP3Config:
             channels=at_least(1),
             language_layers=at_least(0),
             diffusion_steps=at_least(2),
-            inference_steps=at_least(1),
+            inference_steps=at_least(1, at_most=self.diffusion_steps),
         )
+        require(bool(self.point_channels), "baseline.point_channels", "one number or more", self.point_channels)
+        widths = bool(self.channels) and not any(width % DP3_GROUPS for width in self.channels)
+        require(widths, "baseline.channels", f"multiples of {DP3_GROUPS}, one or more", self.channels)
+        require(self.feature % DP3_HEADS == 0, "baseline.feature", f"a multiple of {DP3_HEADS}", self.feature)
 
 
 Baseline = BehaviourCloningConfig | DP3Config

@@ -21,14 +21,14 @@ from dsvla_jax.encoding.coloured_cloud import coloured_cloud
 from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.pose_inputs import ARMS
 from dsvla_jax.model.variables import Variables
-from dsvla_jax.policies.config import DP3Config
+from dsvla_jax.policies.config import DP3_GROUPS, DP3_HEADS, DP3Config
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
 from dsvla_jax.policies.pose_network import Vectors, mean_over_arm
 from dsvla_jax.policies.pose_vectors import VECTOR, center, scale_position
 from dsvla_jax.policies.robot_vector import robot_vector, with_waves
 from dsvla_jax.types import Array, PoseInputs, Text
 
-HEADS, GROUPS, KERNEL = 4, 8, 5
+KERNEL = 5
 # Width of the noise level's embedding, and the longest of its wavelengths in levels.
 LEVEL_WIDTH, LONGEST = 128, 10000.0
 
@@ -60,7 +60,7 @@ class Condition(nn.Module):
         embedded = nn.Embed(self.vocabulary, width, name="words")(words.tokens)
         mask = words.mask[:, None, None]
         for number in range(self.config.language_layers):
-            attention = nn.MultiHeadDotProductAttention(HEADS, name=f"language_{number}")
+            attention = nn.MultiHeadDotProductAttention(DP3_HEADS, name=f"language_{number}")
             seen += attention(nn.LayerNorm(name=f"query_norm_{number}")(seen)[:, None], embedded, mask=mask)[:, 0]
         count = words.mask.sum(axis=1, keepdims=True)
         mean = jnp.where(words.mask[..., None], embedded, 0).sum(axis=1) / count
@@ -101,7 +101,7 @@ class ResidualBlock(nn.Module):
     def __call__(self, x: Array, condition: Array) -> Array:
         def convolve(x: Array, name: str) -> Array:
             x = Convolution(self.channels, KERNEL, name=name)(x)
-            return jax.nn.mish(nn.GroupNorm(GROUPS, name=f"{name}_norm")(x))
+            return jax.nn.mish(nn.GroupNorm(DP3_GROUPS, name=f"{name}_norm")(x))
 
         scale, shift = jnp.split(nn.Dense(2 * self.channels, name="film")(jax.nn.mish(condition)), 2, axis=-1)
         y = convolve(x, "first") * (1 + scale[:, None]) + shift[:, None]

@@ -54,7 +54,8 @@ def unpack(data: bytes) -> Any:
     except MessageError:
         raise
     except (ValueError, TypeError, OverflowError, msgpack.exceptions.UnpackException) as error:
-        raise MessageError(f"message: expected msgpack of plain values and NumPy arrays ({error})") from error
+        why = str(error) or "nested too deeply"
+        raise MessageError(f"message: expected msgpack of plain values and NumPy arrays ({why})") from error
 
 
 def _encode(value: Any) -> Any:

@@ -158,9 +158,13 @@ def _parse(message: Any, expected: Expected) -> Request:
     missing = [name for name in expected.required if name not in message]
     if sent := [name for name in DEPTH_FIELDS if name in message]:
         missing += [name for name in DEPTH_FIELDS if name not in {*sent, *missing}]  # these go together
+    if sent and not expected.depth and missing and not unknown:
+        together = f"{', '.join(DEPTH_FIELDS)} go together: send all of them, or none"
+        raise BadRequest(f"request: missing {', '.join(missing)}; {together}")
     if unknown or missing:
         described = "; ".join(f"{name}: {what}" for name, what in {**expected.fields, **OPTIONAL_FIELDS}.items())
-        raise BadRequest(f"request: missing {missing}, unknown {unknown[:8]}; the fields are {described}")
+        lacks = f"missing {', '.join(missing) or 'none'}, unknown {', '.join(unknown[:8]) or 'none'}"
+        raise BadRequest(f"request: {lacks}; the fields are {described}")
     instruction, reset = message["prompt"], message.get("reset", False)
     if not isinstance(instruction, str) or not instruction.strip() or len(instruction) > MAX_PROMPT:
         raise BadRequest(f"prompt: expected 1 to {MAX_PROMPT} characters, got {_describe(instruction)}")
@@ -228,8 +232,7 @@ def _rgb(rgb: Any, expected: Expected) -> np.ndarray:
     if count > 1:
         sizes += f" of {', '.join(expected.cameras)}"
     if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8 or rgb.ndim != 3 + (count > 1) or rgb.shape[-1] != 3:
-        scale = "; multiply numbers from 0 to 1 by 255" if isinstance(rgb, np.ndarray) and rgb.dtype.kind == "f" else ""
-        raise BadRequest(f"rgb: expected a uint8 array {sizes}, got {_describe(rgb)}; send uint8{scale}")
+        raise BadRequest(f"rgb: expected a uint8 array {sizes}, got {_describe(rgb)}; {_fix_of(rgb)}")
     stacked = rgb if count > 1 else rgb[None]
     if len(stacked) != count or stacked.shape[1:3] not in expected.image_sizes:
         raise BadRequest(
@@ -237,6 +240,14 @@ def _rgb(rgb: Any, expected: Expected) -> np.ndarray:
             "with --image-size HEIGHTxWIDTH"
         )
     return stacked
+
+
+def _fix_of(rgb: object) -> str:
+    """What to do with a picture of another type or number of axes."""
+    if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8:
+        floats = isinstance(rgb, np.ndarray) and rgb.dtype.kind == "f"
+        return "send uint8" + ("; multiply numbers from 0 to 1 by 255" if floats else "")
+    return "send one picture of each camera, without an axis for a single one"
 
 
 def _count_points(pictures: Picture[np.ndarray], encoding: EncodingConfig) -> int:

@@ -24,7 +24,7 @@ def require_same_experiment(run: Path, experiment: Experiment) -> None:
         return
     if fields := outcome_differences(load_experiment(config), experiment):
         raise CheckpointError(
-            f"{config}: this run was started with another config ({', '.join(fields)} differ); "
+            f"{config}: this run was started with another config (another {', '.join(fields)}); "
             "go on with the same one, or choose another --run"
         )
 

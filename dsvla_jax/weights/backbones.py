@@ -158,7 +158,12 @@ def require_base(folder: Path, model: ModelConfig) -> None:
     if is_imported(folder):
         require_same_model(folder, model)
         return
-    base = load_policy_config(folder).model
+    policy = load_policy_config(folder)
+    if policy.baseline is not None:
+        raise CheckpointError(
+            f"{folder}: a policy of {policy.baseline.kind}; expected a run of 3DS-VLA, or a folder of imported weights"
+        )
+    base = policy.model
     found, expected = (
         jax.eval_shape(partial(initialize, config), jax.random.key(0))["params"]
         for config in (base, with_cameras_of(model, base.cameras))
