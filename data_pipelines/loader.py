@@ -9,7 +9,7 @@ from typing import Any, Generic, SupportsIndex, TypeVar
 import grain
 import numpy as np
 
-from data_pipelines.episodes import EpisodeReader
+from data_pipelines.episodes import Contents, EpisodeReader
 from data_pipelines.records import Frame
 from dsvla_jax.errors import DataError
 
@@ -35,13 +35,13 @@ class FrameSource(grain.sources.RandomAccessDataSource[Frame]):
 class EpisodeLoader(Iterator[Sample], Generic[Sample]):
     """Batches with a position that can be saved, together with what it is a position in; made by `make_loader`."""
 
-    def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: dict[str, Any]) -> None:
+    def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: Contents) -> None:
         self._batches, self._folder, self._contents = batches, folder, contents
 
     def __next__(self) -> Sample:
         return next(self._batches)
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> dict[str, object]:
         """JSON: the position, which counts batches, and the demonstrations that it is in (`EpisodeReader.contents`)."""
         return {"position": self._batches.get_state(), "data": self._contents}
 
@@ -59,7 +59,7 @@ class EpisodeLoader(Iterator[Sample], Generic[Sample]):
         self._batches.set_state(state.get("position", state))
 
 
-def _summary(contents: dict[str, Any], other: dict[str, Any]) -> str:
+def _summary(contents: Contents, other: Contents) -> str:
     """The tasks of one that the other has not in the same number."""
     tasks = {task: counts for task, counts in contents["tasks"].items() if other["tasks"].get(task) != counts}
     return ", ".join(f"{task} {n['episodes']} episodes ({n['frames']} frames)" for task, n in tasks.items()) or "none"
