@@ -4,7 +4,7 @@ import json
 import operator
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Generic, SupportsIndex, TypeVar
+from typing import Generic, SupportsIndex, TypeVar
 
 import grain
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from data_pipelines.episodes import Contents, EpisodeReader
 from data_pipelines.records import Frame
 from dsvla_jax.errors import DataError
+from dsvla_jax.json_values import Json
 
 Sample = TypeVar("Sample")
 
@@ -45,18 +46,21 @@ class EpisodeLoader(Iterator[Sample], Generic[Sample]):
         """JSON: the position, which counts batches, and the demonstrations that it is in (`EpisodeReader.contents`)."""
         return {"position": self._batches.get_state(), "data": self._contents}
 
-    def set_state(self, state: dict[str, Any]) -> None:
+    def set_state(self, state: dict[str, Json]) -> None:
         """Continues from a position. Raises DataError if it was saved with other demonstrations than these.
 
         A state without them, as checkpoints of earlier versions hold, is taken at its word.
         """
-        if "data" in state and (then := state["data"]) != (now := json.loads(json.dumps(self._contents))):
+        then, now = json.loads(json.dumps([state.get("data"), self._contents]))
+        if "data" in state and then != now:
             fix = "restore those demonstrations, or start a new run with these (another --run)"
             if then["tasks"] == now["tasks"]:
                 raise DataError(self._folder, "demonstrations", "those of the saved position", "as many others", fix)
             expected, got = _summary(then, now), _summary(now, then)
             raise DataError(self._folder, "demonstrations", f"{expected} as at the saved position", got, fix)
-        self._batches.set_state(state.get("position", state))
+        position = state.get("position", state)
+        assert isinstance(position, dict)
+        self._batches.set_state(position)
 
 
 def _summary(contents: Contents, other: Contents) -> str:

@@ -274,7 +274,7 @@ def unpack_episode(record: bytes, where: object = "episode record") -> Episode:
     version = fields.get("version") if isinstance(fields, dict) else None
     if version != RECORD_VERSION:
         raise DataError(where, "version", str(RECORD_VERSION), repr(version), fix)
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {}  # as read: `check_episode` checks them
     for field in dataclasses.fields(Episode):
         if field.name not in fields:
             if field.default is not dataclasses.MISSING:
