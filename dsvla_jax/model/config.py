@@ -255,7 +255,7 @@ class LoraConfig:
 
     @property
     def scale(self) -> float:
-        """What an adapter's product is multiplied with."""
+        """The factor of an adapter's product A B."""
         return self.alpha / self.rank
 
 
@@ -324,7 +324,7 @@ class ModelConfig:
 
     @property
     def compute_dtype(self) -> jnp.dtype:
-        """Of what the layers compute."""
+        """The dtype that the layers compute in."""
         return jnp.dtype(self.dtype)
 
     @property

@@ -19,7 +19,6 @@ MATRICES = ("kernel", "embedding", "output", "projection", "patch_kernel")
 Variables: TypeAlias = dict[str, Any]
 """Nested dicts of arrays. Of no single depth, so that what a key gives cannot be annotated."""
 
-
 FlatVariables: TypeAlias = dict[tuple[str, ...], Array]
 """The arrays of variables by their paths."""
 
