@@ -45,7 +45,7 @@ def write_data(folder: Path, episodes: int, copies: int = 1) -> None:
     fixture = FIXTURES[NAME]
 
     def episode(number: int) -> dict:
-        made = episode_of(fixture, known_episode(fixture.kind, 1, STEPS, number))
+        made: dict = episode_of(fixture, known_episode(fixture.kind, 1, STEPS, number))
         for step in made["steps"]:
             for view in ("image", "wrist_image"):
                 step["observation"][view] = io.BytesIO(pictures[rng.integers(64)])

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,14 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
+from data_pipelines.episodes import ShardEntry, check_shard, existing_shards, shard_name, write_index, write_shard
 from data_pipelines.processes import complete_in_processes
 from data_pipelines.records import Episode, make_episode, mark_missing
 from dsvla_jax.command_line import configure_jax, ended_by_sigterm, fail_with_message, parse_options
 from dsvla_jax.encoding.keypoints import replay_latch
 from dsvla_jax.errors import UserError
 from dsvla_jax.files import hold_folder
+from dsvla_jax.json_values import Json
 from dsvla_jax.perception.simulator import keypoint_source
 from dsvla_jax.ranges import Range, at_least, check_fields, require
 from dsvla_jax.sim.cameras import FRONT, check_cameras
@@ -71,7 +72,7 @@ class Settings:
     def __post_init__(self) -> None:
         check_fields(self, "", **self._ranges())
 
-    def as_written(self) -> dict[str, Any]:
+    def as_written(self) -> dict[str, Json]:
         """The settings that an index keeps. That a folder has the front camera alone is not written."""
         written = dataclasses.asdict(self)
         if self.cameras == (FRONT,):
@@ -202,7 +203,7 @@ def generate_demonstrations(
     demonstrator: Callable[[str, Settings], Demonstrate] = ScriptedExpert,
     workers: int = 1,
     progress: bool = True,
-    **settings: Any,
+    **settings: object,
 ) -> None:
     """Makes sure that the folder holds at least `episodes` successful demonstrations of every task.
 
@@ -213,13 +214,12 @@ def generate_demonstrations(
     workers: processes at work on a task each; 1 works in this one.
     """
     require(episodes > 0, "episodes", "at least 1", episodes)
-    wanted = Settings(**settings)
+    wanted = replace(Settings(), **settings)
     folder = Path(folder)
 
-    def shards() -> dict[str, dict[str, Any]]:
+    def shards() -> dict[str, ShardEntry]:
         made_with = {**dataclasses.asdict(wanted), "cameras": list(wanted.cameras)}
-        assumed = {"cameras": [FRONT]}
-        return {entry["file"]: entry for entry in existing_shards(folder, made_with, assumed)}
+        return {entry["file"]: entry for entry in existing_shards(folder, made_with, assumed={"cameras": [FRONT]})}
 
     entries = shards()
     with contextlib.ExitStack() as stack:
@@ -238,7 +238,7 @@ def _make_missing(
     missing: Sequence[str],
     episodes: int,
     wanted: Settings,
-    entries: dict[str, dict[str, Any]],
+    entries: dict[str, ShardEntry],
     demonstrator: Callable[[str, Settings], Demonstrate],
     workers: int,
     progress: bool,
@@ -248,7 +248,7 @@ def _make_missing(
     with tqdm(total=episodes * len(tasks), desc="demonstrations", unit="episode", disable=not progress) as bar:
         bar.update(episodes * (len(tasks) - len(missing)))
 
-        def keep(entry: dict[str, Any], successes: int, tried: int) -> None:
+        def keep(entry: ShardEntry, successes: int, tried: int) -> None:
             nonlocal made, attempts
             made, attempts = made + successes, attempts + tried
             if tried:
@@ -275,9 +275,9 @@ def complete_task(
     task: str,
     episodes: int,
     wanted: Settings,
-    entries: Mapping[str, dict[str, Any]],
+    entries: Mapping[str, ShardEntry],
     demonstrator: Callable[[str, Settings], Demonstrate],
-    keep: Callable[[dict[str, Any], int, int], None],
+    keep: Callable[[ShardEntry, int, int], None],
 ) -> None:
     """Writes the missing shards of one task.
 
@@ -309,9 +309,7 @@ def _start_worker() -> None:
     configure_jax()
 
 
-def is_complete(
-    folder: Path, task: str, episodes: int, entries: Mapping[str, dict[str, Any]], digest: bool = True
-) -> bool:
+def is_complete(folder: Path, task: str, episodes: int, entries: Mapping[str, ShardEntry], digest: bool = True) -> bool:
     """Whether so many episodes of the task are there; with `digest` their files are read and compared too."""
     kept, number = 0, 0
     while kept < episodes:
@@ -323,12 +321,12 @@ def is_complete(
     return True
 
 
-def is_usable(folder: Path, entry: dict[str, Any], needed: int, digest: bool = True) -> bool:
+def is_usable(folder: Path, entry: ShardEntry, needed: int, digest: bool = True) -> bool:
     """Returns whether a shard of the index is there, and is long enough if it was cut short when fewer were asked for.
 
     Raises DataError for one that is there but damaged: no file is overwritten unasked.
     """
-    if (entry["cut"] and len(entry["frames"]) < needed) or not (folder / entry["file"]).exists():
+    if (entry.get("cut") and len(entry["frames"]) < needed) or not (folder / entry["file"]).exists():
         return False
     check_shard(folder, entry, digest)
     return True

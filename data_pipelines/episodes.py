@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, NotRequired, TypedDict, Unpack
 
 import numpy as np
 from array_record.python import array_record_module  # pyright: ignore[reportAttributeAccessIssue]
@@ -25,6 +25,7 @@ from data_pipelines.records import (
 from dsvla_jax.encoding.keypoints import REACHED_RADIUS
 from dsvla_jax.errors import DataError
 from dsvla_jax.files import file_digest, replacing, write_bytes, writing
+from dsvla_jax.json_values import Json
 
 FORMAT_NAME = "dsvla-episodes"
 FORMAT_VERSION = 1
@@ -34,15 +35,79 @@ _ONE_SET = "all episodes of a folder are seen by the same cameras: write a folde
 _ONE_SIZE = "pictures of unlike sizes do not batch: resize them (intrinsics too), or write a folder for each size"
 
 
+class ShardNotes(TypedDict, total=False):
+    """What the writers of episodes keep in the index beside each shard. Other readers ignore it."""
+
+    cut: bool
+    """Whether more episodes succeeded than were asked for."""
+    made_with: dict[str, Json]
+    """How the keyframes of a recording were found."""
+    origin: dict[str, str | None]
+    """Imported episodes by name, see `data_pipelines.rlbench`; likewise the rest."""
+    skipped: list[dict[str, str]]
+    variations: list[int]
+    restless: int
+    left_aside: dict[str, int]
+
+
+class ShardEntry(ShardNotes):
+    """A shard in ``index.json``. Fields that are not required are not in folders of earlier versions."""
+
+    file: str
+    task: str
+    num_arms: int
+    frames: list[int]
+    """Of each episode."""
+    digests: NotRequired[list[str]]
+    """Of each episode's record."""
+    picture_size: list[int] | None
+    """Height and width; None of a shard without episodes."""
+    instructions: NotRequired[list[str]]
+    bytes: int
+    sha256: str
+    cameras: NotRequired[list[str]]
+    """Not of episodes with a single camera."""
+
+
+class Index(TypedDict):
+    """The contents of ``index.json``."""
+
+    format: str
+    version: int
+    episodes: int
+    frames: int
+    reached_radius: NotRequired[float]
+    settings: Mapping[str, Json]
+    """How the data were made."""
+    shards: list[ShardEntry]
+
+
+class Contents(TypedDict):
+    """What a reader gives: counts by task in their order, and a digest that tells equal counts apart."""
+
+    tasks: dict[str, dict[str, int]]
+    """By task: how many "episodes" and "frames"."""
+    digest: str
+
+
+class _ChosenShard(ShardEntry):
+    """A shard from its episode `first` on; see `_marks`."""
+
+    first: int
+    marks: list[str] | list[int]
+
+
 def shard_name(task: str, number: int) -> str:
     """The file of a task's shard."""
     return f"{task}-{number:05d}.array_record"
 
 
-def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode], **extra: Any) -> dict[str, Any]:
+def write_shard(
+    folder: Path, name: str, task: str, episodes: Sequence[Episode], **notes: Unpack[ShardNotes]
+) -> ShardEntry:
     """Writes one shard under its final name only once it is complete; returns its index entry.
 
-    episodes: of one task; may be empty. `extra` is kept in the entry: the writer's own notes, which readers ignore.
+    episodes: of one task; may be empty. `notes` are kept in the entry.
     """
     folder.mkdir(parents=True, exist_ok=True)
     kinds = {(episode.task, episode.num_arms) for episode in episodes}
@@ -65,7 +130,7 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
             digests.append(hashlib.blake2b(record, digest_size=8).hexdigest())
             writer.write(record)
         writer.close()
-    return {
+    entry: ShardEntry = {
         "file": name,
         "task": task,
         "num_arms": episodes[0].num_arms if episodes else 0,
@@ -75,14 +140,16 @@ def write_shard(folder: Path, name: str, task: str, episodes: Sequence[Episode],
         "instructions": sorted({episode.instruction for episode in episodes}),
         "bytes": (folder / name).stat().st_size,
         "sha256": file_digest(folder / name),
-        **({"cameras": list(cameras[0])} if cameras and cameras[0] else {}),
-        **extra,
+        **notes,
     }
+    if cameras and cameras[0]:
+        entry["cameras"] = list(cameras[0])
+    return entry
 
 
-def write_index(folder: Path, shards: Sequence[dict[str, Any]], settings: dict[str, Any] | None = None) -> None:
+def write_index(folder: Path, shards: Sequence[ShardEntry], settings: Mapping[str, Json] | None = None) -> None:
     """Writes ``index.json`` atomically. `settings`: how the data were made, for whoever continues or reads them."""
-    index = {
+    index: Index = {
         "format": FORMAT_NAME,
         "version": FORMAT_VERSION,
         "episodes": sum(len(shard["frames"]) for shard in shards),
@@ -94,14 +161,14 @@ def write_index(folder: Path, shards: Sequence[dict[str, Any]], settings: dict[s
     write_bytes(folder / INDEX_FILE, (json.dumps(index, indent=1, sort_keys=True) + "\n").encode())
 
 
-def read_index(folder: Path) -> dict[str, Any]:
+def read_index(folder: Path) -> Index:
     """The checked contents of ``index.json``."""
     path = folder / INDEX_FILE
     fix = "write demonstrations there with `python -m data_pipelines.demos`, or import some (docs/data_own.md)"
     if not path.is_file():
         raise DataError(path, "file", "an index of demonstrations", "no such file", fix)
     try:
-        index = json.loads(path.read_text())
+        index: Index = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise DataError(path, "file", "JSON", str(error), fix) from error
     if not isinstance(index, dict) or index.get("format") != FORMAT_NAME:
@@ -114,19 +181,19 @@ def read_index(folder: Path) -> dict[str, Any]:
     return index
 
 
-def only_camera(index: dict[str, Any]) -> tuple[str, ...]:
+def only_camera(index: Index) -> tuple[str, ...]:
     """The name of the camera of a folder with a single one, as the contents of its index say; empty if they do not."""
     settings = index["settings"]
-    if names := settings.get("cameras"):
-        return tuple(names)
+    if isinstance(names := settings.get("cameras"), list) and names:
+        return tuple(map(str, names))
     # The demonstrations of the simulator name their cameras unless it is the front camera alone.
     name = settings.get("camera") or ("front" if "perturb_probability" in settings else "")
-    return (name,) if name else ()
+    return (str(name),) if name else ()
 
 
 def existing_shards(
-    folder: Path, settings: dict[str, Any], assumed: Mapping[str, Any] | None = None
-) -> list[dict[str, Any]]:
+    folder: Path, settings: Mapping[str, Json], assumed: Mapping[str, Json] | None = None
+) -> list[ShardEntry]:
     """The index entries of a folder made with the same settings, for whoever continues it; none where there is none.
 
     assumed: what folders were made with that are older than a setting.
@@ -142,7 +209,7 @@ def existing_shards(
     return index["shards"]
 
 
-def check_shard(folder: Path, entry: dict[str, Any], digest: bool = False) -> None:
+def check_shard(folder: Path, entry: ShardEntry, digest: bool = False) -> None:
     """Raises DataError unless the shard is there with the size (and, if asked, the sha256) that the index tells."""
     path = folder / entry["file"]
     fix = "delete it and run the program that wrote it again: it continues where files are missing"
@@ -155,7 +222,7 @@ def check_shard(folder: Path, entry: dict[str, Any], digest: bool = False) -> No
 
 
 def write_episodes(
-    folder: Path | str, episodes: Iterable[Episode], per_shard: int = 20, settings: dict[str, Any] | None = None
+    folder: Path | str, episodes: Iterable[Episode], per_shard: int = 20, settings: Mapping[str, Json] | None = None
 ) -> None:
     """Writes a whole data set at once: shards of up to `per_shard` episodes of one task, then the index.
 
@@ -173,7 +240,7 @@ def write_episodes(
     write_index(folder, shards, settings)
 
 
-def _marks(shard: dict[str, Any], first: int, count: int) -> list[Any]:
+def _marks(shard: ShardEntry, first: int, count: int) -> list[str] | list[int]:
     """What tells episodes first .. first + count - 1 of a shard from others, as far as its index entry knows."""
     if "digests" in shard:
         return shard["digests"][first : first + count]
@@ -216,7 +283,7 @@ class EpisodeReader:
                 "generate them, or choose others or all",
             )
         self.tasks = tuple(present if tasks is None else dict.fromkeys(tasks))
-        self.settings: dict[str, Any] = index["settings"]
+        self.settings = index["settings"]
         self._shards = [
             shard for task in self.tasks for shard in self._choose(index["shards"], task, episodes, skip, fewer)
         ]
@@ -224,18 +291,16 @@ class EpisodeReader:
             raise DataError(self.folder, "shards", "at least one episode", "none", "generate demonstrations first")
         for entry in self._shards:
             check_shard(self.folder, entry, digest=verify == "sha256")
-        sizes = {tuple(entry["picture_size"]) for entry in self._shards if entry.get("picture_size")}
+        sizes = {tuple(size) for entry in self._shards if (size := entry.get("picture_size"))}
         if len(sizes) > 1:
             raise DataError(self.folder, "picture size", "one (height, width) for all", str(sorted(sizes)), _ONE_SIZE)
         self.instructions = sorted({text for entry in self._shards for text in entry.get("instructions", ())})
         self.num_arms = {entry["task"]: entry["num_arms"] for entry in self._shards}
         self._first_episode = np.cumsum([0] + [len(entry["frames"]) for entry in self._shards])
         self._first_frame = np.cumsum([0] + [count for entry in self._shards for count in entry["frames"]])
-        self._open: dict[int, Any] = {}
+        self._open: dict[int, array_record_module.ArrayRecordReader] = {}
 
-    def _choose_cameras(
-        self, index: dict[str, Any], wanted: Sequence[str] | None
-    ) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    def _choose_cameras(self, index: Index, wanted: Sequence[str] | None) -> tuple[tuple[str, ...], tuple[int, ...]]:
         """Returns the names of the cameras to give, and their numbers among those of the folder.
 
         No name is known of some folders' only camera.
@@ -253,15 +318,16 @@ class EpisodeReader:
         return tuple(wanted), tuple(names.index(name) for name in wanted)
 
     def _choose(
-        self, shards: Sequence[dict[str, Any]], task: str, episodes: int | None, skip: int, fewer: bool
-    ) -> list[dict[str, Any]]:
+        self, shards: Sequence[ShardEntry], task: str, episodes: int | None, skip: int, fewer: bool
+    ) -> list[_ChosenShard]:
         """The task's shards, cut down to `episodes` of it after the first `skip`; `first` is where a shard begins."""
         mine = [shard for shard in shards if shard["task"] == task]
         count = max(sum(len(shard["frames"]) for shard in mine) - skip, 0)
         if episodes is not None and count < episodes and not fewer:
             fix = f"run `python -m data_pipelines.demos {self.folder} --tasks {task} --episodes {episodes}`"
             raise DataError(self.folder, f"episodes of {task}", f"at least {episodes}", str(count), fix)
-        chosen, left = [], count if episodes is None else episodes
+        chosen: list[_ChosenShard] = []
+        left = count if episodes is None else episodes
         for shard in mine:
             first = min(skip, len(shard["frames"]))
             frames = shard["frames"][first : first + left]
@@ -269,8 +335,8 @@ class EpisodeReader:
             skip, left = skip - first, left - len(chosen[-1]["frames"])
         return [shard for shard in chosen if shard["frames"]]
 
-    def contents(self) -> dict[str, Any]:
-        """What the reader gives, as JSON: counts by task in their order, and a digest that tells equal counts apart.
+    def contents(self) -> Contents:
+        """What the reader gives, as JSON.
 
         It stays the same while the folder grows by episodes that this reader does not give.
         """
@@ -282,7 +348,7 @@ class EpisodeReader:
         marks = [[entry["task"], *entry["marks"]] for entry in self._shards]
         return {"tasks": tasks, "digest": hashlib.blake2b(json.dumps(marks).encode(), digest_size=8).hexdigest()}
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         # Open files do not travel to worker processes; each opens its own.
         return {**self.__dict__, "_open": {}}
 
@@ -291,6 +357,7 @@ class EpisodeReader:
 
     @property
     def num_frames(self) -> int:
+        """Frames of all episodes."""
         return int(self._first_frame[-1])
 
     def episode(self, number: int) -> Episode:

@@ -67,6 +67,7 @@ def _active(poses: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
 
 
 def main(options: Options) -> None:
+    """Writes the demonstrations again with the keypoints that are found, and prints how many."""
     reader, table = EpisodeReader(options.demos), (*options.grounding.table(), *suite_phrases())
     settings = {
         "importer": "find_keypoints",

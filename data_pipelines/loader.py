@@ -4,14 +4,15 @@ import json
 import operator
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Generic, SupportsIndex, TypeVar
+from typing import Generic, SupportsIndex, TypeVar
 
 import grain
 import numpy as np
 
-from data_pipelines.episodes import EpisodeReader
+from data_pipelines.episodes import Contents, EpisodeReader
 from data_pipelines.records import Frame
 from dsvla_jax.errors import DataError
+from dsvla_jax.json_values import Json
 
 Sample = TypeVar("Sample")
 
@@ -35,31 +36,34 @@ class FrameSource(grain.sources.RandomAccessDataSource[Frame]):
 class EpisodeLoader(Iterator[Sample], Generic[Sample]):
     """Batches with a position that can be saved, together with what it is a position in; made by `make_loader`."""
 
-    def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: dict[str, Any]) -> None:
+    def __init__(self, batches: grain.DatasetIterator[Sample], folder: Path, contents: Contents) -> None:
         self._batches, self._folder, self._contents = batches, folder, contents
 
     def __next__(self) -> Sample:
         return next(self._batches)
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> dict[str, object]:
         """JSON: the position, which counts batches, and the demonstrations that it is in (`EpisodeReader.contents`)."""
         return {"position": self._batches.get_state(), "data": self._contents}
 
-    def set_state(self, state: dict[str, Any]) -> None:
+    def set_state(self, state: dict[str, Json]) -> None:
         """Continues from a position. Raises DataError if it was saved with other demonstrations than these.
 
         A state without them, as checkpoints of earlier versions hold, is taken at its word.
         """
-        if "data" in state and (then := state["data"]) != (now := json.loads(json.dumps(self._contents))):
+        then, now = json.loads(json.dumps([state.get("data"), self._contents]))
+        if "data" in state and then != now:
             fix = "restore those demonstrations, or start a new run with these (another --run)"
             if then["tasks"] == now["tasks"]:
                 raise DataError(self._folder, "demonstrations", "those of the saved position", "as many others", fix)
             expected, got = _summary(then, now), _summary(now, then)
             raise DataError(self._folder, "demonstrations", f"{expected} as at the saved position", got, fix)
-        self._batches.set_state(state.get("position", state))
+        position = state.get("position", state)
+        assert isinstance(position, dict)
+        self._batches.set_state(position)
 
 
-def _summary(contents: dict[str, Any], other: dict[str, Any]) -> str:
+def _summary(contents: Contents, other: Contents) -> str:
     """The tasks of one that the other has not in the same number."""
     tasks = {task: counts for task, counts in contents["tasks"].items() if other["tasks"].get(task) != counts}
     return ", ".join(f"{task} {n['episodes']} episodes ({n['frames']} frames)" for task, n in tasks.items()) or "none"

@@ -10,14 +10,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.managers import SyncManager
-from typing import Any
 
 from dsvla_jax.errors import UserError
 
 
 def complete_in_processes(
     work: Callable[..., None],
-    jobs: Sequence[tuple[Any, ...]],
+    jobs: Sequence[tuple[object, ...]],
     workers: int,
     keep: Callable[..., None],
     start: Callable[[], None] | None = None,
@@ -73,5 +72,5 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _work_and_report(work: Callable[..., None], job: tuple[Any, ...], finished: Any) -> None:
+def _work_and_report(work: Callable[..., None], job: tuple[object, ...], finished: queue.Queue) -> None:
     work(*job, lambda *report: finished.put(report))

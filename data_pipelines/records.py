@@ -248,7 +248,7 @@ def select_cameras(episode: Episode, numbers: Sequence[int]) -> Episode:
 def pack_episode(episode: Episode) -> bytes:
     """The record of an episode; equal episodes give equal bytes."""
 
-    def plain(value: Any) -> Any:
+    def plain(value: object) -> object:
         if isinstance(value, np.ndarray):
             little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
             return {"dtype": little.dtype.str, "shape": list(little.shape), "data": little.tobytes()}
@@ -274,7 +274,7 @@ def unpack_episode(record: bytes, where: object = "episode record") -> Episode:
     version = fields.get("version") if isinstance(fields, dict) else None
     if version != RECORD_VERSION:
         raise DataError(where, "version", str(RECORD_VERSION), repr(version), fix)
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {}  # as read: `check_episode` checks them
     for field in dataclasses.fields(Episode):
         if field.name not in fields:
             if field.default is not dataclasses.MISSING:
@@ -291,7 +291,7 @@ def unpack_episode(record: bytes, where: object = "episode record") -> Episode:
     return episode
 
 
-def _unpack_array(value: Any, where: object, field: str) -> np.ndarray:
+def _unpack_array(value: object, where: object, field: str) -> np.ndarray:
     if not isinstance(value, dict) or value.get("dtype") not in _DTYPES:
         raise DataError(where, field, f"an array of {_DTYPES}", repr(value)[:60], "generate the data again")
     dtype, shape, data = np.dtype(value["dtype"]), tuple(value["shape"]), value["data"]

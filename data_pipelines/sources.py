@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from data_pipelines.demos import generate_demonstrations
 from data_pipelines.episodes import EpisodeReader
@@ -30,9 +30,9 @@ def open_demonstrations(data: DataConfig, tokenizer: Tokenizer) -> EpisodeReader
 
     Raises UserError where an instruction has words that a word-level tokenizer does not know.
     """
-    folder, tasks, workers = Path(data.folder), choose_tasks(data), os.cpu_count() or 1
+    folder, tasks = Path(data.folder), choose_tasks(data)
     if data.source == "simulator":
-        generate_demonstrations(folder, tasks, data.episodes, workers=workers, **_simulator_settings(data))
+        _simulate(data, folder, tasks, data.episodes, "train")
         return EpisodeReader(folder, tasks=tasks, episodes=data.episodes, cameras=data.cameras)
     reader = _open_folder(data, tokenizer)
     if (present := len(EpisodeReader(folder, tasks=tasks))) > len(reader):
@@ -57,9 +57,8 @@ def open_held_out(data: DataConfig, tokenizer: Tokenizer, episodes: int) -> Epis
     """
     tasks = choose_tasks(data)
     if data.source == "simulator":
-        folder, workers = Path(f"{data.folder}_validation"), os.cpu_count() or 1
-        settings = _simulator_settings(data)
-        generate_demonstrations(folder, tasks, episodes, workers=workers, split="validation", **settings)
+        folder = Path(f"{data.folder}_validation")
+        _simulate(data, folder, tasks, episodes, "validation")
         return EpisodeReader(folder, tasks=tasks, episodes=episodes, cameras=data.cameras)
     folder = Path(data.folder)
     if used := [task for task in tasks if len(EpisodeReader(folder, tasks=(task,))) <= data.episodes]:
@@ -118,6 +117,18 @@ def require_oxe_fits(oxe: OxeConfig, encoding: EncodingConfig, tokenizer: Tokeni
     return picture
 
 
-def _simulator_settings(data: DataConfig) -> dict[str, Any]:
-    names = ("image_size", "cameras", "seed", "perturb", "keypoints")
-    return {name: getattr(data, name) for name in names}
+def _simulate(
+    data: DataConfig, folder: Path, tasks: tuple[str, ...], episodes: int, split: Literal["train", "validation"]
+) -> None:
+    generate_demonstrations(
+        folder,
+        tasks,
+        episodes,
+        workers=os.cpu_count() or 1,
+        split=split,
+        image_size=data.image_size,
+        cameras=data.cameras,
+        seed=data.seed,
+        perturb=data.perturb,
+        keypoints=data.keypoints,
+    )

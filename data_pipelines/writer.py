@@ -5,11 +5,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 
-from data_pipelines.episodes import INDEX_FILE, read_index, shard_name, write_index, write_shard
+from data_pipelines.episodes import INDEX_FILE, ShardEntry, read_index, shard_name, write_index, write_shard
 from data_pipelines.keyframes import (
     STILL,
     STOP_BUFFER,
@@ -62,7 +61,7 @@ class DemonstrationWriter:
         self.still, self.stop_buffer = still, stop_buffer
         self._discovered = self._restless = 0
         self._settings = {"importer": "recordings"}
-        self._entries: list[dict[str, Any]] = []
+        self._entries: list[ShardEntry] = []
         self._waiting: dict[str, list[Episode]] = {}
         self._lock = hold_folder(self.folder, "adds demonstrations there")
         try:
@@ -71,13 +70,13 @@ class DemonstrationWriter:
             self._lock.close()
             raise
         self._report_strays()
-        self._sizes = {entry["task"]: tuple(entry["picture_size"]) for entry in self._entries}
+        self._sizes = {entry["task"]: tuple(entry["picture_size"]) for entry in self._entries if entry["picture_size"]}
         self._cameras = {tuple(entry.get("cameras", ())) for entry in self._entries}
         self._counts = {entry["task"]: 0 for entry in self._entries}
         for entry in self._entries:
             self._counts[entry["task"]] += len(entry["frames"])
 
-    def _read_entries(self) -> list[dict[str, Any]]:
+    def _read_entries(self) -> list[ShardEntry]:
         if not (self.folder / INDEX_FILE).exists():
             return []
         index = read_index(self.folder)

@@ -71,6 +71,7 @@ def draw(name: str) -> Path:
 
 
 def row(task: Task) -> str:
+    """A task's line of the table."""
     words = sys.modules[f"dsvla_jax.sim.tasks.{task.name}"].__doc__ or ""
     meaning = re.sub(r"\s*RLBench[^:]*: \w+\.$", "", words.split("\n")[0])
     picture = f"images/tasks/{task.name}.png"
@@ -96,6 +97,7 @@ def tpu_table(results: dict[str, dict[str, float]]) -> str:
 
 
 def write_page() -> Path:
+    """Writes the page of all tasks; returns its path."""
     parts = [INTRODUCTION.format(count=len(TASKS))]
     for arms, title in GROUPS.items():
         tasks = [task for _, task in sorted(TASKS.items()) if task.num_arms == arms]
@@ -110,6 +112,7 @@ def write_page() -> Path:
 
 
 def main(options: Options) -> None:
+    """Draws the pictures of the tasks that the options name, and writes the page."""
     configure_jax()
     for name in select_tasks(options.tasks):
         print(draw(name), flush=True)

@@ -27,6 +27,7 @@ def demonstration(name: str) -> np.ndarray:
 
 
 def main() -> None:
+    """Draws the picture of demonstrations."""
     configure_jax()
     strips = [demonstration(name) for name in DataConfig().tasks]
     path = Path(__file__).parent / "images" / "episodes.png"

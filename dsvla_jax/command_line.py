@@ -13,15 +13,17 @@ import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import tyro
 
 from dsvla_jax.errors import UserError
+
+Parsed = TypeVar("Parsed")
 
 _UNREACHABLE = (errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETUNREACH)
 
@@ -190,7 +192,7 @@ def keep_freed_memory() -> None:
             mallopt(parameter, value)
 
 
-def parse_options(options: Any, **settings: Any) -> Any:
+def parse_options(options: Callable[..., Parsed], **settings: Any) -> Parsed:  # noqa: ANN401, those of `tyro.cli`
     """`tyro.cli`, but for values that a config refuses: those end in the config's own message (UserError).
 
     options: what tyro makes an object of; if a function, one that only returns what it is given. settings: as tyro's.

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cattrs
 
@@ -52,7 +52,7 @@ def _problems(error: Exception) -> Iterator[str]:
         yield from cattrs.transform_error(error)
 
 
-def _refusals(error: Any) -> Iterator[str]:
+def _refusals(error: object) -> Iterator[str]:
     if isinstance(error, UserError):
         yield str(error)
     for part in getattr(error, "exceptions", ()):

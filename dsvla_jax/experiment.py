@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from dsvla_jax.config_files import read_config
 from dsvla_jax.data_config import DataConfig, OxeConfig
@@ -263,7 +263,7 @@ def outcome_differences(one: Experiment, other: Experiment) -> list[str]:
     return [name for name in _differences(one, other) if name.split(".")[0] not in FREE_TO_CHANGE]
 
 
-def _differences(one: Any, other: Any) -> list[str]:
+def _differences(one: object, other: object) -> list[str]:
     if type(one) is not type(other) or not dataclasses.is_dataclass(one):
         return []
     names = []

@@ -10,7 +10,7 @@ import math
 import types
 import typing
 from numbers import Integral, Real
-from typing import Any, Literal
+from typing import Literal
 
 from dsvla_jax.errors import UserError
 
@@ -73,7 +73,7 @@ def require_box(field: str, low: tuple[float, ...], other: str, high: tuple[floa
     require(below, field, f"less than {other} {high} on each axis", low)
 
 
-def check_fields(config: Any, section: str, **ranges: Range) -> None:
+def check_fields(config: object, section: str, **ranges: Range) -> None:
     """Raises UserError if a field of a dataclass is out of its range, or no choice of its Literal type.
 
     section: what stands before the field's name on the command line ("data"), empty for nothing. ranges: by field, one
@@ -104,11 +104,11 @@ class _Kind:
 
     number: type | None = None
     count: int | None = None
-    choices: tuple[Any, ...] = ()
+    choices: tuple[object, ...] = ()
 
 
-def _check_number(option: str, number: Any, kind: type, allowed: Range, whole: Any) -> None:
-    right: Any = Integral if kind is int else Real
+def _check_number(option: str, number: float, kind: type, allowed: Range, whole: object) -> None:
+    right = Integral if kind is int else Real
     expected = "a whole number" if kind is int else "a number"
     require(isinstance(number, right) and not isinstance(number, bool), option, expected, repr(whole))
     require(number in allowed, option, allowed, whole)
@@ -122,7 +122,7 @@ def _kinds(cls: type) -> dict[str, _Kind]:
     return {field.name: _kind(hints[field.name]) for field in dataclasses.fields(cls)}
 
 
-def _kind(hint: Any) -> _Kind:
+def _kind(hint: object) -> _Kind:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint in (int, float):
         return _Kind(hint)

@@ -203,3 +203,7 @@ class ModelInputs(Generic[ArrayT]):
     """int32: camera * N + patch: the image patch (row-major) that a 3D token is aligned with, and whose positional
     embedding it carries."""
     text: Text[ArrayT]
+
+
+NumpyOrJax = TypeVar("NumpyOrJax", np.ndarray, jax.Array)
+"""The arrays of one library: what a function of both is given and returns."""

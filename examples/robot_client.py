@@ -43,6 +43,14 @@ class Robot(Protocol):
         ...
 
 
+class RemotePolicy(Protocol):
+    """A client of a policy server: a `PolicyClient`, or openpi-client's `WebsocketClientPolicy`."""
+
+    def infer(self, observation: dict[str, Any], /) -> dict[str, Any]:
+        """The reply to an observation; docs/serving.md has the fields of both."""
+        ...
+
+
 class SimulatedRobot:
     """One episode of a task in C MuJoCo, from a start that no demonstration has.
 
@@ -69,6 +77,7 @@ class SimulatedRobot:
         self._own = np.asarray(self.environment.keypoints(self._state))[0]
 
     def observe(self) -> dict[str, Any]:
+        """See `Robot`. Raises UserError if an object is not seen."""
         seen = self.environment.observe(self._state)
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[0], seen)
         # The fields of a single camera have no camera axis.
@@ -90,10 +99,12 @@ class SimulatedRobot:
         return observation if self._kind == "none" else {**observation, "keypoints": self._own}
 
     def move(self, pose: np.ndarray, gripper_open: np.ndarray) -> None:
+        """See `Robot`."""
         action = Action(pose=np.asarray(pose)[None], gripper_open=np.asarray(gripper_open)[None])  # type: ignore[arg-type]
         self._state = self.environment.step(self._state, action)
 
     def done(self) -> bool:
+        """See `Robot`."""
         return bool(np.asarray(self.environment.success(self._state))[0])
 
 
@@ -108,10 +119,12 @@ class DryRun:
         self._robot, self._low, self._high, self._longest = robot, np.array(low), np.array(high), longest_move
 
     def observe(self) -> dict[str, Any]:
+        """See `Robot`."""
         self._seen = self._robot.observe()
         return self._seen
 
     def move(self, pose: np.ndarray, gripper_open: np.ndarray) -> None:
+        """Prints each arm's next keyframe."""
         for arm, (target, gripper, now) in enumerate(zip(pose, gripper_open, self._seen["pose"], strict=True)):
             distance = float(np.linalg.norm(target[:3] - now[:3]))
             inside = bool(np.all((target[:3] >= self._low) & (target[:3] <= self._high)))
@@ -123,11 +136,12 @@ class DryRun:
             )
 
     def done(self) -> bool:
+        """Never: nothing moves."""
         return False
 
 
-def run_episode(policy: Any, robot: Robot, prompt: str, keyframes: int) -> bool:
-    """Asks and moves until the robot is done. policy: a `PolicyClient`, or openpi-client's `WebsocketClientPolicy`."""
+def run_episode(policy: RemotePolicy, robot: Robot, prompt: str, keyframes: int) -> bool:
+    """Asks and moves until the robot is done; returns whether it is."""
     for step in range(keyframes):
         reply = policy.infer({**robot.observe(), "prompt": prompt, "reset": step == 0})
         actions = reply["actions"][0].reshape(-1, 8)
@@ -187,6 +201,7 @@ class Options:
 
 
 def main(options: Options) -> int:
+    """Runs one episode; returns 0 for success and for a dry run, else 1."""
     if options.keyframes < 1 or options.seed < 0 or not options.longest_move > 0:
         raise UserError(
             "--keyframes: expected at least 1, --seed at least 0, --longest-move more than 0; got "

@@ -407,7 +407,9 @@ def test_a_token_keeps_others_out(policy):
         assert get(port, "/healthz")[0] == 200
         openpis = {"Authorization": "Api-Key secret"}
         with websockets.sync.client.connect(f"ws://127.0.0.1:{port}", additional_headers=openpis) as connection:
-            assert unpack(connection.recv(decode=False))["name"] == "policy"
+            metadata = unpack(connection.recv(decode=False))
+            assert isinstance(metadata, dict)
+            assert metadata["name"] == "policy"
         with PolicyClient(port=port, token="secret") as client:
             assert client.infer(observation(0))["text"]
 

@@ -12,7 +12,6 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -93,7 +92,7 @@ def load_index(build: RldsBuild, dataset: OxeDataset, config: OxeConfig, progres
     if path is not None and path.is_file():
         # One that was cut short in copying is made again.
         with contextlib.suppress(ValueError):
-            return _unpack(json.loads(path.read_text()))
+            return _unpack(path.read_text())
     if path is not None:
         _report_other_versions(path, dataset, config)
     index = scan(build, dataset, config, progress)
@@ -288,7 +287,7 @@ def _report_other_versions(path: Path, dataset: OxeDataset, config: OxeConfig) -
 
 
 def _pack(index: Index) -> dict[str, Json]:
-    def plain(value: Any) -> Json:  # noqa: ANN401, any field of an Index
+    def plain(value: np.ndarray | list | tuple | str | float | None) -> Json:
         if isinstance(value, np.ndarray):
             return value.tolist()
         return [plain(item) for item in value] if isinstance(value, list | tuple) else value
@@ -296,8 +295,9 @@ def _pack(index: Index) -> dict[str, Json]:
     return {field.name: plain(getattr(index, field.name)) for field in dataclasses.fields(index)}
 
 
-def _unpack(stored: dict[str, Any]) -> Index:
-    # Any: `_pack` wrote it, and the version in the file's name is that of this code.
+def _unpack(text: str) -> Index:
+    # `_pack` wrote it, and the version in the file's name is that of this code.
+    stored = json.loads(text)
     arrays = {name: np.array(stored[name], np.int64) for name in ("shard", "record", "samples")}
     offsets = None if stored["offsets"] is None else [np.array(row, np.int64) for row in stored["offsets"]]
     arrays |= {name: np.array(stored[name], np.float64) for name in ("low", "high")}

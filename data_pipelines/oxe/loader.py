@@ -6,7 +6,7 @@ import operator
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any, SupportsIndex, cast
+from typing import SupportsIndex, cast
 
 import grain
 import numpy as np
@@ -62,9 +62,8 @@ class OxeLoader(Iterator[Example[np.ndarray]]):
         self._left_out = _LeftOut()
         for entry in self.source.left_out:
             self._left_out.report(entry)
-        # Any: grain's types lose what its `map` makes.
-        to_batch: Any = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self._left_out.report)
-        batches: Any = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
+        to_batch = make_batcher(config, encoding, tokenizer, mixture_scale, seed, self._left_out.report)
+        batches = grain.MapDataset.source(_Batches(self.source, batch_size, process_index, process_count))
         options = grain.ReadOptions(num_threads=num_threads, prefetch_buffer_size=ahead)
         dataset = batches.map(to_batch).to_iter_dataset(options)
         self._batches = cast(grain.DatasetIterator[Example[np.ndarray]], iter(dataset))

@@ -8,13 +8,13 @@ import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
 from tqdm import tqdm
 
-from data_pipelines.episodes import check_shard, existing_shards, shard_name, write_index, write_shard
+from data_pipelines.episodes import ShardNotes, check_shard, existing_shards, shard_name, write_index, write_shard
 from data_pipelines.keyframes import (
     STILL,
     STOP_BUFFER,
@@ -56,7 +56,7 @@ class Settings:
         require(bool(self.cameras) and distinct, "cameras", "different names", self.cameras)
         check_fields(self, "", **self._ranges())
 
-    def as_written(self) -> dict[str, Any]:
+    def as_written(self) -> dict[str, Json]:
         """The settings that an index keeps: a single camera as `camera`, several as `cameras`."""
         fields = dataclasses.asdict(self)
         first, *others = fields.pop("cameras")
@@ -197,7 +197,7 @@ def _import_missing(
                         skipped.append({"episode": str(folder), "reason": str(error)})
                         origin[origin_name(task, folder)] = None
                     bar.update()
-                notes = {
+                notes: ShardNotes = {
                     "origin": origin,
                     "skipped": skipped,
                     "variations": sorted({episode.variation for episode in good if episode.variation is not None}),
@@ -206,7 +206,7 @@ def _import_missing(
                 }
                 entries[name] = write_shard(out, name, task, good, **notes)
                 write_index(out, [entries[key] for key in sorted(entries)], wanted)
-    return [item for entry in entries.values() for item in entry["skipped"]]
+    return [item for entry in entries.values() for item in entry.get("skipped", ())]
 
 
 def main(options: Options) -> None:

@@ -190,7 +190,7 @@ class _Pictures(Sequence[np.ndarray]):
     """The colour pictures of one camera, read when asked for.
 
     Raises DataError unless there is one an observation; with `keyframes_only` one that is missing is missed when asked
-    for. Any number of leading zeros will do. Hidden files are passed over: archives of macOS have them.
+    for. Leading zeros do not count. Hidden files are passed over: archives of macOS have them.
     """
 
     def __init__(self, folder: Path, name: str, count: int, keyframes_only: bool) -> None:

@@ -228,7 +228,7 @@ def _shard_name(template: str, dataset: str, split: str, suffix: str, number: in
 
 
 def _read_json(path: str) -> dict[str, Any]:
-    # Any: what tfds wrote; whoever uses a value says what it should have been.
+    # What tfds wrote: whoever uses a value says what it should have been.
     try:
         value = json.loads(files.read_text(path))
     except ValueError as error:

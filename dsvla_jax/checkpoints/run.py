@@ -36,8 +36,9 @@ class Arrays:
     """What a step keeps as arrays, each an item of its own on disk.
 
     trainable: the variables that learn, by collection and module. optimizer: the optimizer's state over exactly those.
-    counters: int32 (), by name. rng: random keys, by name. average: the moving average of the variables that learn, by
-    which the policy acts; empty where there is none, and then no item on disk.
+    counters: int32 (); rng: random keys; both by the names on disk, which the training loop chooses. average: the
+    moving average of the variables that learn, by which the policy acts; empty where there is none, and then no item on
+    disk.
     """
 
     trainable: PyTree

@@ -5,7 +5,7 @@ frame. Quaternion components are counted in hundredths. The gripper is 0 or 1.
 """
 
 import dataclasses
-from typing import Any
+from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +35,7 @@ class PoseCodec:
     """Intervals along each side of the box (paper: 200). A position is round(value / step) with step = (high - low) /
     bins."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         metres = Range(-1000, 1000)
         check_fields(self, "encoding.codec", low=metres, high=metres, bins=at_least(1))
         require_box("encoding.codec.low", self.low, "high", self.high)
@@ -84,7 +84,7 @@ class PoseCodec:
         rounded quaternions are not quite of unit length. Four zeros name no rotation and stay four zeros.
         """
         xp = _namespace(integers)
-        values: Any = xp.asarray(integers)
+        values = xp.asarray(integers)
         position = values[..., :3].astype(np.float32) * self.step
         rotation = values[..., 3:7].astype(np.float32)
         length = xp.sqrt(xp.sum(rotation * rotation, axis=-1, keepdims=True))
@@ -94,7 +94,7 @@ class PoseCodec:
         )
 
 
-def _canonical_sign(rotation: Array, xp: Any) -> Array:
+def _canonical_sign(rotation: Array, xp: ModuleType) -> Array:
     sign = np.int32(1)
     for component in (2, 1, 0, 3):  # the last one written wins: w before x before y before z
         value = rotation[..., component]
@@ -102,6 +102,6 @@ def _canonical_sign(rotation: Array, xp: Any) -> Array:
     return sign
 
 
-def _namespace(*arrays: Any) -> Any:
+def _namespace(*arrays: object) -> ModuleType:
     plain = (np.ndarray, np.generic, float, int, list, tuple)
     return np if all(isinstance(array, plain) for array in arrays) else jnp

@@ -42,7 +42,7 @@ class EncodingConfig:
     use_points: bool = True
     """Give the vision encoder 3D tokens (paper, section 3.2); false is the ablation."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self,
             "encoding",

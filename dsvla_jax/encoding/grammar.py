@@ -47,6 +47,7 @@ class NumberSlot:
 
     @property
     def values(self) -> range:
+        """The integers, in ascending order."""
         return range(self.low, self.low + len(self.tokens))
 
 
@@ -59,6 +60,7 @@ class AnswerGrammar:
 
     @property
     def num_arms(self) -> int:
+        """A: how many arms an answer is for."""
         return len(self.slots) // VALUES_PER_ARM
 
     def tokens(self, integers: np.ndarray) -> list[int]:

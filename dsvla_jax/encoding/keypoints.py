@@ -4,7 +4,7 @@ An arm has K keypoints in the order the instruction names them. The active one i
 5 cm of; it never goes back, and the last one stays active for good. Arms with fewer than K keypoints repeat their last.
 """
 
-from typing import Any
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,8 @@ def active_keypoint(latched_count: ArrayLike, keypoints: ArrayLike, count: Array
     Returns:
         float (3,). A NumPy array if ``keypoints`` is one.
     """
-    xp: Any = np if isinstance(keypoints, np.ndarray) else jnp
-    points: Any = xp.asarray(keypoints)
+    xp = _library(keypoints)
+    points = xp.asarray(keypoints)
     last = (points.shape[0] if count is None else xp.asarray(count)) - 1
     return points[xp.clip(xp.asarray(latched_count), 0, last)]
 
@@ -48,8 +48,8 @@ def advance_latch(
     Returns:
         int32 (A,), at least ``latched``. A NumPy array if ``keypoints`` is one.
     """
-    xp: Any = np if isinstance(keypoints, np.ndarray) else jnp
-    points: Any = xp.asarray(keypoints)
+    xp = _library(keypoints)
+    points = xp.asarray(keypoints)
     distance = xp.linalg.norm(points - xp.asarray(end_effector)[:, None, :], axis=-1)
     reached = (distance < radius) | (xp.arange(points.shape[1]) < xp.asarray(latched)[:, None])
     return xp.sum(xp.cumprod(reached.astype(np.int32), axis=1), axis=1, dtype=np.int32)
@@ -64,3 +64,7 @@ def replay_latch(end_effector: ArrayLike, keypoints: ArrayLike) -> Array:
         return latched, jax.vmap(active_keypoint)(latched, keypoints)
 
     return jax.lax.scan(look, jnp.zeros(keypoints.shape[0], jnp.int32), jnp.asarray(end_effector))[1]
+
+
+def _library(array: ArrayLike) -> ModuleType:
+    return np if isinstance(array, np.ndarray) else jnp

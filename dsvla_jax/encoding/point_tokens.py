@@ -42,7 +42,7 @@ class PointTokenizerConfig:
     """Root mean square of every token after standardisation. Set it to that of the vision tower's patch embeddings:
     larger tokens would drown the positional embeddings added to them."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self,
             "encoding.points",

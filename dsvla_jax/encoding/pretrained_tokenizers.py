@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import sentencepiece
 import tokenizers
@@ -54,12 +53,15 @@ class HuggingFaceTokenizer:
 
     @property
     def vocab_size(self) -> int:
+        """See `Tokenizer`."""
         return self._vocab_size
 
     def encode(self, text: str) -> list[int]:
+        """See `Tokenizer`."""
         return self._tokenizer.encode(text, add_special_tokens=False).ids
 
     def decode(self, tokens: Sequence[int]) -> str:
+        """See `Tokenizer`."""
         return self._tokenizer.decode([int(token) for token in tokens], skip_special_tokens=True)
 
     def save(self, folder: Path) -> None:
@@ -69,7 +71,7 @@ class HuggingFaceTokenizer:
         texts = {name: self._tokenizer.id_to_token(number) for name, number in names.items()}
         (folder / "tokenizer_config.json").write_text(json.dumps(texts, indent=1) + "\n", encoding="utf-8")
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
@@ -87,24 +89,30 @@ class SentencePieceTokenizer:
 
     @property
     def vocab_size(self) -> int:
+        """See `Tokenizer`."""
         return self._model.vocab_size()
 
     @property
     def bos_id(self) -> int:
+        """See `Tokenizer`."""
         return self._model.bos_id()
 
     @property
     def eos_id(self) -> int:
+        """See `Tokenizer`."""
         return self._model.eos_id()
 
     @property
     def pad_id(self) -> int:
+        """See `Tokenizer`."""
         return self._model.pad_id() if self._model.pad_id() >= 0 else self.eos_id
 
     def encode(self, text: str) -> list[int]:
+        """See `Tokenizer`."""
         return self._model.encode(text)
 
     def decode(self, tokens: Sequence[int]) -> str:
+        """See `Tokenizer`."""
         # The library writes nothing for control tokens, but would write " ⁇ " for the unknown one, as it should.
         return self._model.decode([int(token) for token in tokens])
 
@@ -112,7 +120,7 @@ class SentencePieceTokenizer:
         """Writes a tokenizer's folder."""
         (folder / "tokenizer.model").write_bytes(self.content)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {"content": self.content}
 
 
@@ -184,10 +192,10 @@ def _special_token(folder: Path, tokenizer: tokenizers.Tokenizer, name: str) -> 
             content = json.loads(file.read_text(encoding="utf-8"))
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
             raise UserError(f"tokenizer: {file}: expected JSON; the file is damaged ({error})") from error
-        text: Any = content.get(f"{name}_token")
-        number: Any = content.get(f"{name}_token_id")
+        text: str | dict[str, str] | None = content.get(f"{name}_token")
+        number: int | list[int] | None = content.get(f"{name}_token_id")
         text = text.get("content") if isinstance(text, dict) else text
-        number = number[0] if isinstance(number, list) and number else number
+        number = next(iter(number), None) if isinstance(number, list) else number
         if text is not None:
             number = tokenizer.token_to_id(text)
             if number is None:

@@ -27,27 +27,41 @@ class Tokenizer(Protocol):
     """
 
     @property
-    def vocab_size(self) -> int: ...
+    def vocab_size(self) -> int:
+        """V: how many tokens there are."""
+        ...
 
     @property
-    def pad_id(self) -> int: ...
+    def pad_id(self) -> int:
+        """The token of padding."""
+        ...
 
     @property
-    def bos_id(self) -> int: ...
+    def bos_id(self) -> int:
+        """The token that begins a text."""
+        ...
 
     @property
-    def eos_id(self) -> int: ...
+    def eos_id(self) -> int:
+        """The token that ends a text."""
+        ...
 
-    def encode(self, text: str) -> list[int]: ...
+    def encode(self, text: str) -> list[int]:
+        """A text's tokens."""
+        ...
 
-    def decode(self, tokens: Sequence[int]) -> str: ...
+    def decode(self, tokens: Sequence[int]) -> str:
+        """The text of tokens."""
+        ...
 
     @property
     def number_values(self) -> np.ndarray | None:
         """float32 (V,): the value of each token that is an integer of its own, NaN elsewhere; None for none."""
         ...
 
-    def save(self, folder: pathlib.Path) -> None: ...
+    def save(self, folder: pathlib.Path) -> None:
+        """Writes a tokenizer's folder."""
+        ...
 
 
 def split_words(text: str) -> list[str]:
@@ -71,7 +85,7 @@ class WordTokenizer:
 
     words: tuple[str, ...]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         wrong = [word for word in self.words if _is_number(word) or split_words(word) != [word]]
         if wrong or len(set(self.words)) != len(self.words):
             raise ValueError(f"WordTokenizer: expected distinct single lower-case words, use vocabulary(); got {wrong}")
@@ -87,22 +101,27 @@ class WordTokenizer:
 
     @property
     def vocab_size(self) -> int:
+        """See `Tokenizer`; likewise the rest."""
         return len(self.pieces)
 
     @property
     def pad_id(self) -> int:
+        """<pad>."""
         return 0
 
     @property
     def unk_id(self) -> int:
+        """<unk>."""
         return 1
 
     @property
     def bos_id(self) -> int:
+        """<s>."""
         return 2
 
     @property
     def eos_id(self) -> int:
+        """</s>."""
         return 3
 
     @property
@@ -120,10 +139,12 @@ class WordTokenizer:
         return word in self._ids or (_is_number(word) and LOWEST_NUMBER <= float(word) <= HIGHEST_NUMBER)
 
     def encode(self, text: str) -> list[int]:
+        """A text's tokens. Raises ValueError for an integer out of range."""
         ids = self._ids
         return [ids[word] if word in ids else self._encode_word(word, text) for word in split_words(text)]
 
     def decode(self, tokens: Sequence[int]) -> str:
+        """The words, separated by spaces."""
         special = (self.pad_id, self.bos_id, self.eos_id)
         return " ".join(self.pieces[int(token)] for token in tokens if int(token) not in special)
 

@@ -5,6 +5,7 @@ prompt, the answer with how probable each number was, and where the arm went.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -31,7 +32,7 @@ from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
 from dsvla_jax.sim.tasks import select_tasks
-from dsvla_jax.types import Action, Observation, split_cameras
+from dsvla_jax.types import Action, Camera, Observation, split_cameras
 
 SHOWN = 480  # pixels a side of a picture on the page
 NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
@@ -65,7 +66,7 @@ class Step:
     numbers: list[list[tuple[str, str, float]]]
 
 
-def draw_tokens(rgb: np.ndarray, centers: np.ndarray, patches: np.ndarray, camera, grid: int) -> np.ndarray:
+def draw_tokens(rgb: np.ndarray, centers: np.ndarray, patches: np.ndarray, camera: Camera, grid: int) -> np.ndarray:
     """Draws the enlarged picture with each 3D token's centre (G, 3) joined to the middle of its patch (G,).
 
     Patches that have tokens are outlined. A token of the workspace's far side is blue, of the near side yellow.
@@ -92,7 +93,9 @@ def draw_tokens(rgb: np.ndarray, centers: np.ndarray, patches: np.ndarray, camer
     return picture
 
 
-def draw_keypoints(picture: np.ndarray, keypoints: np.ndarray, camera, image_size: tuple[int, int]) -> np.ndarray:
+def draw_keypoints(
+    picture: np.ndarray, keypoints: np.ndarray, camera: Camera, image_size: tuple[int, int]
+) -> np.ndarray:
     """Crosses, enlarged likewise, at points (N, 3) before the camera."""
     pixels, depth = map(np.asarray, project(jnp.asarray(keypoints), camera))
     picture = picture.copy()
@@ -159,7 +162,7 @@ def main(options: Options) -> None:
     state = environment.reset(episode_keys(0, "eval", task, options.seed, 1))
     steps: list[Step] = []
 
-    def act(seen: Observation, instructions, near: np.ndarray) -> tuple[Action, list[str]]:
+    def act(seen: Observation, instructions: Sequence[str], near: np.ndarray) -> tuple[Action, list[str]]:
         decision = policy.decide(seen, instructions, near)
         steps.append(describe(policy, seen, instructions[0], near[0], decision))
         print(f"keyframe {len(steps)}: {decision.texts[0]}", flush=True)

@@ -5,7 +5,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ class Rollout:
 
     state: SimState
     """The last."""
-    answers: Any
+    answers: object
     """Those of every keyframe, as the policy gives them, with an axis L in front; see `DevicePolicy`."""
     targets: Float[Array, "l b a 3"]
     """Positions of the keyframes; what follows an episode's end means nothing."""
@@ -41,12 +41,12 @@ class _Carry(NamedTuple):
     done: Array
     state: SimState
     latched: Array
-    answers: Any
+    answers: object
     targets: Array
     keyframes: Array
 
 
-Loop = Callable[[Physics, Variables, SimState, Array, Any], Rollout]
+Loop = Callable[[Physics, Variables, SimState, Array, object], Rollout]
 
 
 def device_loop(environment: Environment, policy: DevicePolicy, limit: int) -> Loop:
@@ -62,7 +62,7 @@ def device_loop(environment: Environment, policy: DevicePolicy, limit: int) -> L
     def run(physics: Physics, variables: Variables, state: SimState, keypoints: Array, question: object) -> Rollout:
         batch = keypoints.shape[0]
 
-        def decide(observation: Observation[Array], active: Array) -> tuple[Action[Array], Any]:
+        def decide(observation: Observation[Array], active: Array) -> tuple[Action[Array], object]:
             return policy.act(variables, observation, question, active)
 
         def goes_on(carry: _Carry) -> Array:
@@ -171,7 +171,7 @@ class DeviceLoop:
             )
         return outcomes
 
-    def _answers(self, rollout: Rollout, count: int) -> list[Any]:
+    def _answers(self, rollout: Rollout, count: int) -> list[object]:
         host = jax.tree.map(np.asarray, rollout.answers)
         return [jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(count)]
 

@@ -1,20 +1,17 @@
 """Unit quaternions, [x, y, z, w] with the real part last, as in RLBench, and rotation vectors (axis times angle).
 
 Every function takes float arrays with any leading shape, broadcasts, and is differentiable away from its singularities.
-Those generic in `AnyArray` compute NumPy's arrays with NumPy, in their own precision: jax.numpy would round float64.
+Those generic in `NumpyOrJax` compute NumPy's arrays with NumPy, in their own precision: jax.numpy would round float64.
 Formulas: https://en.wikipedia.org/wiki/Quaternions_and_spatial_rotation.
 """
 
 from types import ModuleType
-from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from dsvla_jax.types import Array
-
-AnyArray = TypeVar("AnyArray", np.ndarray, Array)
+from dsvla_jax.types import Array, NumpyOrJax
 
 # A half turn about x less a half turn about z: the gripper's approach axis (its own +z) points along world -z.
 DOWN = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
@@ -31,7 +28,7 @@ def quaternion_multiply(left: ArrayLike, right: ArrayLike) -> Array:
     return hamilton_product(jnp.asarray(left), jnp.asarray(right))
 
 
-def hamilton_product(left: AnyArray, right: AnyArray) -> AnyArray:
+def hamilton_product(left: NumpyOrJax, right: NumpyOrJax) -> NumpyOrJax:
     """`quaternion_multiply` of two arrays of one library."""
     library = _library(left)
     x1, y1, z1, w1 = library.moveaxis(left, -1, 0)
@@ -71,7 +68,7 @@ def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
     )
 
 
-def rotation_vector_to_quaternion(vector: AnyArray) -> AnyArray:
+def rotation_vector_to_quaternion(vector: NumpyOrJax) -> NumpyOrJax:
     """Rotation vectors (..., 3) -> unit quaternions (..., 4)."""
     library = _library(vector)
     angle = library.linalg.norm(vector, axis=-1, keepdims=True)
@@ -80,7 +77,7 @@ def rotation_vector_to_quaternion(vector: AnyArray) -> AnyArray:
     return library.concatenate([imaginary, library.cos(angle / 2)], axis=-1)
 
 
-def quaternion_to_rotation_vector(quaternion: AnyArray) -> AnyArray:
+def quaternion_to_rotation_vector(quaternion: NumpyOrJax) -> NumpyOrJax:
     """Unit quaternions (..., 4) -> rotation vectors (..., 3) of at most half a turn."""
     library = _library(quaternion)
     real = quaternion[..., 3:]
@@ -90,7 +87,7 @@ def quaternion_to_rotation_vector(quaternion: AnyArray) -> AnyArray:
     return imaginary * library.where(sine < 1e-6, 2.0, angle / library.maximum(sine, 1e-6))
 
 
-def quaternion_to_matrix(quaternion: AnyArray) -> AnyArray:
+def quaternion_to_matrix(quaternion: NumpyOrJax) -> NumpyOrJax:
     """Unit quaternions (..., 4) -> rotation matrices (..., 3, 3)."""
     library = _library(quaternion)
     x, y, z, w = library.moveaxis(quaternion, -1, 0)

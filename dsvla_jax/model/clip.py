@@ -6,6 +6,8 @@ positional alignment), so the pretrained encoder needs no new parameters for it.
 positions; one learned embedding for each of several cameras tells them apart.
 """
 
+from functools import partial
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -39,19 +41,20 @@ class VisionBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, _: None = None) -> tuple[Array, None]:
+        """x (B, T, width) -> the same shape, and None for the loop over layers."""
         vision, dtype = self.config.vision, self.config.compute_dtype
-        options = {"use_bias": True, "lora": self.config.lora_for("vision"), "dtype": dtype}
+        linear = partial(LoraDense, use_bias=True, lora=self.config.lora_for("vision"), dtype=dtype)
         into_residual = residual_init(vision.layers)
 
         x = constrain(x, "batch")
         y = layer_norm(vision.norm_eps, "attention_norm")(x)
-        query, key, value = (split_heads(LoraDense(vision.width, name=n, **options)(y), vision.heads) for n in "qkv")
+        query, key, value = (split_heads(linear(vision.width, name=n)(y), vision.heads) for n in "qkv")
         y = join_heads(attend(query, key, value, implementation=self.config.attention))
-        x = x + LoraDense(vision.width, kernel_init=into_residual, name="o", **options)(y)
+        x = x + linear(vision.width, kernel_init=into_residual, name="o")(y)
 
         y = layer_norm(vision.norm_eps, "mlp_norm")(x)
-        y = quick_gelu(LoraDense(vision.ffn, name="up", **options)(y))
-        x = x + LoraDense(vision.width, kernel_init=into_residual, name="down", **options)(y)
+        y = quick_gelu(linear(vision.ffn, name="up")(y))
+        x = x + linear(vision.width, kernel_init=into_residual, name="down")(y)
         return x, None
 
 
@@ -67,6 +70,7 @@ class VisionTower(nn.Module):
 
     @nn.compact
     def __call__(self, images: Array, point_tokens: Array, point_patches: Array) -> Array:
+        """The outputs of every token. Raises ValueError for inputs of other sizes than the config's."""
         vision, dtype = self.config.vision, self.config.compute_dtype
         cameras = self.config.cameras
         expected = (cameras, vision.image_size, vision.image_size, 3)

@@ -41,7 +41,7 @@ class VisionConfig:
     """Width of CLIP's joint embedding of images and text (ViT-L/14: 768), to which every output is projected, as
     LLaMA-Adapter reads it; None keeps the outputs before that projection."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self,
             "model.vision",
@@ -75,6 +75,7 @@ class VisionConfig:
 
     @property
     def ffn(self) -> int:
+        """Hidden width of a layer's MLP."""
         return round(self.width * self.mlp_ratio)
 
 
@@ -94,7 +95,7 @@ class RopeScaling:
     original_context: int = 8192
     """Tokens of the context that the model was first trained with."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self,
             "model.language.rope_scaling",
@@ -141,7 +142,7 @@ class LanguageConfig:
     """Linear layers with a bias, among q, k, v, o, gate, up and down. LLaMA has none; LLaMA-Adapter trains those of q,
     o, gate, up and down."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self,
             "model.language",
@@ -180,6 +181,7 @@ class LanguageConfig:
 
     @property
     def head_dim(self) -> int:
+        """D: width of a head."""
         return self.explicit_head_dim or self.width // self.heads
 
 
@@ -205,7 +207,7 @@ class VisualPromptConfig:
     prompted_layers: int | None = None
     """Layers of the language model, counted from its end, that attend to a prompt; None for all."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self,
             "model.visual_prompt",
@@ -242,7 +244,7 @@ class LoraConfig:
     init: Literal["kaiming", "normal"] = "kaiming"
     """Distribution of A: kaiming is uniform in +-1/sqrt(inputs), as in peft; normal has standard deviation 0.02."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "model.lora", rank=COUNT, alpha=more_than(0))
         for name, chosen, known in (
             ("targets", self.targets, LORA_TARGETS),
@@ -253,6 +255,7 @@ class LoraConfig:
 
     @property
     def scale(self) -> float:
+        """The factor of an adapter's product A B."""
         return self.alpha / self.rank
 
 
@@ -297,7 +300,7 @@ class ModelConfig:
     """Layers per iteration of the loop over layers. More layers cost compile time and save loop overhead. With all
     layers of the language model, training also skips what its last layer would compute for visual tokens."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "model", cameras=at_least(1, at_most=4), point_width=COUNT, scan_unroll=COUNT)
         require(
             self.point_width in (None, self.vision.width),
@@ -321,6 +324,7 @@ class ModelConfig:
 
     @property
     def compute_dtype(self) -> jnp.dtype:
+        """The dtype that the layers compute in."""
         return jnp.dtype(self.dtype)
 
     @property

@@ -9,7 +9,7 @@ each integer that the slot admits. docs/decoding.md has the picture.
 import dataclasses
 import itertools
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ class Decoding:
     temperature: float = 1.0
     samples: int = 1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.temperature <= 0 or self.samples < 1:
             raise ValueError(f"Decoding: expected temperature > 0 and samples >= 1, got {self}")
         if self.choice != "sample" and (self.temperature, self.samples) != (1.0, 1):
@@ -100,7 +100,7 @@ class _DecodeStep:
     reads the chosen one. template: int32 (C,). tree: of the number to come.
     """
 
-    slot: Any
+    slot: int | np.ndarray | Array
     offset: int | np.ndarray | Array
     before: Numbers
     template: np.ndarray | Array
@@ -150,7 +150,7 @@ def decode_actions(
     read = _CacheState(cache, jnp.arange(cache.keys.shape[3]) < lengths[:, None], lengths)
     written = _Answer(*(jnp.zeros((batch, len(trees)), dtype) for dtype in (jnp.int32, jnp.float32, jnp.float32)))
 
-    def choose(written: _Answer, slot: int | Array, hidden: Array, tree: IntegerTrie) -> _Answer:
+    def choose(written: _Answer, slot: int | np.ndarray | Array, hidden: Array, tree: IntegerTrie) -> _Answer:
         logits = lm_head(model, stack_layers(variables), hidden, tree.choices.tokens)
         log_probs = _admitted(log_probabilities(logits, tree.choices), written, slot, tree.numbers)
         index = _choose(log_probs, tree.numbers, decoding, keys, slot)[:, None]
@@ -240,7 +240,7 @@ def _extend(
     return x, _CacheState(cache, valid, read.lengths + length + len(template))
 
 
-def _admitted(log_probs: Array, written: _Answer, slot: int | Array, numbers: Numbers) -> Array:
+def _admitted(log_probs: Array, written: _Answer, slot: int | np.ndarray | Array, numbers: Numbers) -> Array:
     """Distributions (B, N) over integers, minus infinity exactly where none may be chosen, whatever the logits were.
 
     Besides rows that are no integer, that is 0 for the last part of a quaternion whose other parts are 0, which would
@@ -254,7 +254,9 @@ def _admitted(log_probs: Array, written: _Answer, slot: int | Array, numbers: Nu
     return jnp.where(admitted, jax.nn.log_softmax(jnp.where(admitted, log_probs, -jnp.inf), axis=-1), -jnp.inf)
 
 
-def _choose(log_probs: Array, numbers: Numbers, decoding: Decoding, keys: Array | None, slot: int | Array) -> Array:
+def _choose(
+    log_probs: Array, numbers: Numbers, decoding: Decoding, keys: Array | None, slot: int | np.ndarray | Array
+) -> Array:
     """int32 (B,): rows of ``numbers``, never one of log-probability minus infinity."""
     if decoding.choice == "expected":
         values = jnp.asarray(numbers.values)
@@ -268,7 +270,7 @@ def _choose(log_probs: Array, numbers: Numbers, decoding: Decoding, keys: Array 
 
 def _stack(group: list[_DecodeStep]) -> _DecodeStep:
     """Passes of one shape in arrays with an axis in front."""
-    branches: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *(one.tree.branches for one in group))
+    branches = jax.tree.map(lambda *leaves: np.stack(leaves), *(one.tree.branches for one in group))
     return _DecodeStep(
         slot=np.array([one.slot for one in group], np.int32),
         offset=np.array([one.offset for one in group], np.int32),
@@ -282,13 +284,13 @@ def _stack(group: list[_DecodeStep]) -> _DecodeStep:
     )
 
 
-def _repeat(tree: Any, times: int) -> Any:
+def _repeat(tree: tuple[Array, KVCache, Array], times: int) -> tuple[Array, KVCache, Array]:
     """Every example ``times`` times, side by side; (root, cache, lengths), of which the cache's axis 1 is the batch."""
     root, cache, lengths = tree
     prompt = cache.prompt
     if prompt is not None:
-        prompt = prompt.replace(
-            keys=jnp.repeat(prompt.keys, times, axis=1), values=jnp.repeat(prompt.values, times, axis=1)
+        prompt = dataclasses.replace(
+            prompt, keys=jnp.repeat(prompt.keys, times, axis=1), values=jnp.repeat(prompt.values, times, axis=1)
         )
     cache = KVCache(jnp.repeat(cache.keys, times, axis=1), jnp.repeat(cache.values, times, axis=1), prompt)
     return jnp.repeat(root, times, axis=0), cache, jnp.repeat(lengths, times, axis=0)

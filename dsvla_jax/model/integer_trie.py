@@ -7,7 +7,6 @@ product of the choices on its path. Where each integer is one token, the tree is
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -162,7 +161,7 @@ def _rectangle(rows: Sequence[Sequence[int]], filling: int) -> np.ndarray:
     return array
 
 
-def _padded(array: Any, *shape: int, filling: int = 0) -> np.ndarray:
+def _padded(array: np.ndarray | Array, *shape: int, filling: int = 0) -> np.ndarray:
     array = np.asarray(array)
     more = [(0, size - old) for size, old in zip(shape, array.shape, strict=False)]
     return np.pad(array, more, constant_values=filling)

@@ -1,14 +1,15 @@
 """What both towers are made of: initialisers, LayerNorm, and the loop over layers with its rematerialisation."""
 
-from typing import Any
+from typing import TypeVar
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.nn.initializers import Initializer
 
 from dsvla_jax.model.config import ModelConfig
 
-Initializer = Any
+Layer = TypeVar("Layer", bound=nn.Module)
 
 # Short names of jax.checkpoint_policies.
 REMAT_POLICIES = {"full": "nothing_saveable", "dots": "dots_with_no_batch_dims_saveable"}
@@ -26,7 +27,7 @@ def layer_norm(epsilon: float, name: str) -> nn.LayerNorm:
     return nn.LayerNorm(epsilon=epsilon, dtype=jnp.float32, use_fast_variance=False, name=name)
 
 
-def rematerialised(block, config: ModelConfig) -> Any:
+def rematerialised(block: type[Layer], config: ModelConfig) -> type[Layer]:
     """``block`` as the config says that its backward pass is to be done."""
     if config.remat == "none":
         return block
@@ -34,13 +35,13 @@ def rematerialised(block, config: ModelConfig) -> Any:
     return nn.remat(block, prevent_cse=False, policy=getattr(jax.checkpoint_policies, name))
 
 
-def over_layers(block, config: ModelConfig, layers: int, in_axes: Any = nn.broadcast) -> Any:
+def over_layers(block: type[Layer], config: ModelConfig, layers: int, in_axes: object = nn.broadcast) -> type[Layer]:
     """``block`` scanned over ``layers``: its variables get a leading layers axis; rematerialised as the config says."""
     return nn.scan(
         rematerialised(block, config),
         variable_axes={"params": 0, "lora": 0},
         split_rngs={"params": True},
-        in_axes=in_axes,
+        in_axes=in_axes,  # pyright: ignore[reportArgumentType], typed by its default, an int
         length=layers,
         unroll=config.scan_unroll,
     )

@@ -4,7 +4,6 @@ Touvron et al. 2023; parameter layout and rotation as in Hugging Face's Llama.
 """
 
 import dataclasses
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -14,7 +13,7 @@ from flax import struct
 
 from dsvla_jax.model.attention import attend, join_heads, split_heads
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
-from dsvla_jax.model.layers import over_layers, rematerialised, residual_init
+from dsvla_jax.model.layers import KERNEL_INIT, Initializer, over_layers, rematerialised, residual_init
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
 from dsvla_jax.types import Array
@@ -61,6 +60,7 @@ class KVCache:
 
     @classmethod
     def empty(cls, config: ModelConfig, batch: int, slots: int) -> "KVCache":
+        """A cache of zeros, without a prompt."""
         language = config.language
         shape = (language.layers, batch, language.kv_heads, slots, language.head_dim)
         zeros = jnp.zeros(shape, config.compute_dtype)
@@ -74,6 +74,7 @@ class RMSNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
+        """x (..., width) -> float32 of the same shape."""
         scale = self.param("scale", nn.initializers.ones_init(), (x.shape[-1],))
         x = x.astype(jnp.float32)
         return x * jax.lax.rsqrt(jnp.mean(jnp.square(x), axis=-1, keepdims=True) + self.epsilon) * scale
@@ -134,13 +135,17 @@ class DecoderBlock(nn.Module):
         shared: PromptTokens | None = None,
         prompt: LayerPrompts | PromptCache | None = None,
     ) -> tuple[Array, KVCache | None]:
+        """x (B, T, width) and `rotary_tables` -> the layer's outputs, and its cache with keys and values written.
+
+        mask: bool (B or 1, T, S), the slots each position may look at; all if None. See `Llama.__call__` for the rest.
+        """
         language, dtype = self.config.language, self.config.compute_dtype
         into_residual = residual_init(language.layers)
         x = constrain(x, "batch")
 
-        def linear(name: str, width: int, **options: Any) -> LoraDense:
+        def linear(name: str, width: int, kernel_init: Initializer = KERNEL_INIT) -> LoraDense:
             bias, lora = name in language.biases, self.config.lora_for("language")
-            return LoraDense(width, name=name, use_bias=bias, lora=lora, dtype=dtype, **options)
+            return LoraDense(width, name=name, use_bias=bias, lora=lora, dtype=dtype, kernel_init=kernel_init)
 
         query_width, kv_width = language.heads * language.head_dim, language.kv_heads * language.head_dim
 
@@ -184,6 +189,7 @@ class Llama(nn.Module):
     config: ModelConfig
 
     def setup(self) -> None:
+        """Makes embeddings, layers and the last norm."""
         language = self.config.language
         # Unit-norm rows: with tied weights the first logits then have unit variance.
         self.embedding = self.param(
@@ -235,6 +241,7 @@ class Llama(nn.Module):
             # The prompt goes beside the cache and not in it, so that the loop over layers does not write it anew.
             cached = cache.prompt
             x, text = self.layers(x, tables, mask, dataclasses.replace(cache, prompt=None), index, None, cached)
+            assert text is not None
             cache = KVCache(text.keys, text.values, cached)
         return self.norm(x[:, first_row:]).astype(self.config.compute_dtype), cache
 

@@ -7,16 +7,17 @@ Hu et al. 2021, "LoRA: Low-Rank Adaptation of Large Language Models", equation 3
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import traverse_util
+from jax.typing import DTypeLike
 
 from dsvla_jax.model.config import LoraConfig
 from dsvla_jax.model.layers import KERNEL_INIT, Initializer
 from dsvla_jax.model.quantize import SCALE, dequantize
+from dsvla_jax.model.variables import flat_variables
 from dsvla_jax.types import Array
 
 
@@ -59,11 +60,12 @@ class LoraDense(nn.Module):
     features: int
     use_bias: bool = False
     lora: LoraConfig | None = None
-    dtype: Any = jnp.float32
+    dtype: DTypeLike = jnp.float32
     kernel_init: Initializer = KERNEL_INIT
 
     @nn.compact
     def __call__(self, x: Array, adapted: bool = True) -> Array:
+        """x (..., in) -> (..., features), of `dtype`."""
         inputs = x.shape[-1]
         # Tokens are merged into one axis: of a 3D product XLA's CPU compiler would transpose the output's gradient, and
         # compute all that is fused into it again, for the kernel's gradient.
@@ -86,7 +88,7 @@ class LoraDense(nn.Module):
             y = x @ kernel.astype(self.dtype)
             if quantized:
                 y = y * self.get_variable("params", SCALE).astype(self.dtype)
-            if a is not None:
+            if a is not None and b is not None:
                 y = y + (x @ a) @ b
         if self.use_bias:
             bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
@@ -95,8 +97,7 @@ class LoraDense(nn.Module):
 
 
 def _add_adapters(params: Mapping, adapters: Mapping, scale: float) -> dict:
-    flat: dict[tuple, Any] = dict(traverse_util.flatten_dict(dequantize(params)))
-    flat_adapters: dict[tuple, Any] = dict(traverse_util.flatten_dict(adapters))
+    flat, flat_adapters = flat_variables(dequantize(params)), flat_variables(adapters)
     for path in flat_adapters:
         if path[-1] != "a":
             continue
@@ -135,7 +136,7 @@ def require_mergeable(variables: Mapping) -> None:
 def merge_lora(variables: Mapping, lora: LoraConfig) -> dict:
     """Add the adapters to the base weights: {"params", "lora"} -> {"params"} of the same outputs without adapters.
 
-    Any part of a model will do. Raises ValueError as `require_mergeable` does.
+    A part of a model will do. Raises ValueError as `require_mergeable` does.
     """
     require_mergeable(variables)
     return {"params": _add_adapters(variables["params"], variables.get("lora", {}), lora.scale)}

@@ -8,10 +8,10 @@ stage 3) and `tensor` (the hidden width of each layer is split: Shoeybi et al. 2
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.types import Array
 
@@ -57,7 +57,7 @@ def logical_axes(path: tuple[str, ...]) -> tuple[str | None, ...]:
     return by_name.get(name) or _PARAMETERS.get(name, ())
 
 
-def partition_spec(axes: tuple[str | None, ...], shape: tuple[int, ...], mesh: Any) -> PartitionSpec:
+def partition_spec(axes: tuple[str | None, ...], shape: tuple[int, ...], mesh: Mesh | AbstractMesh) -> PartitionSpec:
     """The spec of an array whose dimensions have these names; one that its mesh axes do not divide is not split."""
 
     def split(size: int, name: str | None) -> tuple[str, ...] | None:
@@ -67,13 +67,13 @@ def partition_spec(axes: tuple[str | None, ...], shape: tuple[int, ...], mesh: A
     return PartitionSpec(*map(split, shape, axes))
 
 
-def shardings(tree: Any, mesh: Mesh) -> Any:
-    """A NamedSharding for each leaf of a tree whose leaves are variables, or stand at the places of variables.
+def shardings(tree: object, mesh: Mesh) -> object:
+    """The tree with a NamedSharding for each leaf; the leaves are variables, or stand at the places of variables.
 
     That covers a whole training state: the moments of an optimizer have the paths of the parameters they belong to.
     """
 
-    def of(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
+    def of(path: jax.tree_util.KeyPath, leaf: Array) -> NamedSharding:
         axes = logical_axes(tuple(key.key for key in path if isinstance(key, jax.tree_util.DictKey)))
         axes = axes if len(axes) <= len(leaf.shape) else ()
         names = (None,) * (len(leaf.shape) - len(axes)) + axes
@@ -82,7 +82,7 @@ def shardings(tree: Any, mesh: Mesh) -> Any:
     return jax.tree_util.tree_map_with_path(of, tree)
 
 
-def make_sharded(make: Callable[..., Tree], mesh: Mesh, *arguments: Any) -> Tree:
+def make_sharded(make: Callable[..., Tree], mesh: Mesh, *arguments: object) -> Tree:
     """``make(*arguments)``, a pure function of arrays, with every leaf of its result made split over the mesh."""
     return jax.jit(make, out_shardings=shardings(jax.eval_shape(make, *arguments), mesh))(*arguments)
 

@@ -4,11 +4,12 @@ Symmetric, one scale for each output of a layer, no calibration ("absmax"; Dettm
 2.1, without its outliers). Products are computed in the model's dtype, so this saves memory and not time.
 """
 
-from typing import Any
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 from flax import traverse_util
 
+from dsvla_jax.model.variables import FlatVariables, Variables, flat_variables
 from dsvla_jax.types import Array
 
 KERNEL, SCALE = "kernel", "kernel_scale"
@@ -29,11 +30,10 @@ def quantize_kernel(kernel: Array) -> tuple[Array, Array]:
     return jnp.round(kernel / scale[..., None, :]).astype(jnp.int8), scale
 
 
-def quantize(params: dict[str, Any]) -> dict[str, Any]:
+def quantize(params: Variables) -> Variables:
     """A model's params with the kernels of both towers' layers in 8 bits, each beside its scale."""
-    flat: dict[tuple[str, ...], Any] = {}
-    leaves: dict[tuple[str, ...], Any] = traverse_util.flatten_dict(params)
-    for path, leaf in leaves.items():
+    flat: FlatVariables = {}
+    for path, leaf in flat_variables(params).items():
         if is_quantized(path):
             flat[path], flat[(*path[:-1], SCALE)] = quantize_kernel(leaf)
         else:
@@ -41,9 +41,9 @@ def quantize(params: dict[str, Any]) -> dict[str, Any]:
     return traverse_util.unflatten_dict(flat)
 
 
-def dequantize(params: Any) -> dict[str, Any]:
+def dequantize(params: Mapping) -> Variables:
     """The inverse of `quantize` but for rounding, float32; params without 8-bit kernels stay as they are."""
-    flat: dict[tuple[str, ...], Any] = dict(traverse_util.flatten_dict(params))
+    flat = flat_variables(params)
     for path in [path for path in flat if path[-1] == SCALE]:
         kernel = (*path[:-1], KERNEL)
         flat[kernel] = flat[kernel].astype(jnp.float32) * flat.pop(path)[..., None, :]

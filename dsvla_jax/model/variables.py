@@ -1,10 +1,12 @@
 """Which of a model's variables learn and which are frozen, as operations on nested dicts."""
 
+from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias, assert_never, cast
 
-import jax
 import jax.numpy as jnp
 from flax import traverse_util
+
+from dsvla_jax.types import Array
 
 PROJECTOR = "projector"
 CAMERA_EMBEDDING = "camera_embedding"
@@ -15,9 +17,18 @@ POSE_HEAD = "pose_head"
 MATRICES = ("kernel", "embedding", "output", "projection", "patch_kernel")
 
 Variables: TypeAlias = dict[str, Any]
+"""Nested dicts of arrays. Of no single depth, so that what a key gives cannot be annotated."""
+
+FlatVariables: TypeAlias = dict[tuple[str, ...], Array]
+"""The arrays of variables by their paths."""
 
 Regime = Literal["full", "lora", "adapters"]
 """What is trained."""
+
+
+def flat_variables(variables: Mapping) -> FlatVariables:
+    """The arrays by their paths; `traverse_util.unflatten_dict` is the inverse."""
+    return cast(FlatVariables, traverse_util.flatten_dict(variables))
 
 
 def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Variables]:
@@ -27,7 +38,7 @@ def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Va
     the "lora" collection alone, on a base whose projector is pretrained (as in the authors' released training code).
     The embeddings of several cameras and a pose head learn always: no pretrained model has them.
     """
-    flat = traverse_util.flatten_dict(variables)
+    flat = flat_variables(variables)
 
     def learns(path: tuple[str, ...]) -> bool:
         if path[-1] == CAMERA_EMBEDDING or path[1] == POSE_HEAD:
@@ -49,14 +60,13 @@ def split_variables(variables: Variables, regime: Regime) -> tuple[Variables, Va
 
 def narrow_frozen(frozen: Variables, dtype: jnp.dtype) -> Variables:
     """The frozen variables with those that the model only ever reads in ``dtype`` kept in it: no result changes."""
-    flat = cast(dict[tuple[str, ...], jax.Array], traverse_util.flatten_dict(frozen))
     narrow = {
         path: leaf.astype(dtype) if path[-1] in MATRICES and leaf.dtype != jnp.int8 else leaf
-        for path, leaf in flat.items()
+        for path, leaf in flat_variables(frozen).items()
     }
     return traverse_util.unflatten_dict(narrow)
 
 
 def join_variables(trainable: Variables, frozen: Variables) -> Variables:
     """The inverse of `split_variables`."""
-    return traverse_util.unflatten_dict(traverse_util.flatten_dict(frozen) | traverse_util.flatten_dict(trainable))
+    return traverse_util.unflatten_dict(flat_variables(frozen) | flat_variables(trainable))

@@ -5,13 +5,14 @@ gave it. Parameters have the names of those works. What a layer does with its pr
 """
 
 import dataclasses
+from functools import partial
 
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
 
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
-from dsvla_jax.model.layers import KERNEL_INIT, layer_norm, over_layers
+from dsvla_jax.model.layers import layer_norm, over_layers
 from dsvla_jax.model.llama import DecoderBlock, LayerPrompts, PromptTokens, RMSNorm, rotary_tables
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.partition import constrain
@@ -49,11 +50,12 @@ class VisualPrompt(nn.Module):
 
     @nn.compact
     def __call__(self, vision_outputs: Array, point_patches: Array) -> tuple[PromptTokens, LayerPrompts]:
+        """What all layers share, and what each has of its own."""
         prompt, language, dtype = self.config.visual_prompt, self.config.language, self.config.compute_dtype
         batch = vision_outputs.shape[0]
-        with_bias = {"use_bias": True, "dtype": dtype, "kernel_init": KERNEL_INIT}
+        linear = partial(LoraDense, use_bias=True, dtype=dtype)
 
-        x = LoraDense(prompt.width, name="clip_proj", **with_bias)(vision_outputs)
+        x = linear(prompt.width, name="clip_proj")(vision_outputs)
         x = layer_norm(1e-5, "clip_proj_norm")(x).astype(dtype)
         patches = self.config.vision.num_patches
         row_count = 1 + patches
@@ -75,7 +77,7 @@ class VisualPrompt(nn.Module):
         x, _ = layers(x, rotary_tables(positions, blocks.language, length), None)
         x = RMSNorm(prompt.norm_eps, name="visual_blocks_norm")(x[:, : rows.shape[1]])
         x = LoraDense(prompt.width, name="visual_blocks_output", dtype=dtype)(x)
-        x = LoraDense(language.width, name="visual_proj", **with_bias)(x)
+        x = linear(language.width, name="visual_proj")(x)
         tokens = constrain(layer_norm(1e-5, "visual_proj_norm")(x).astype(dtype), "batch")
 
         # Small rows: every layer's prompt starts as the visual tokens. A gate of zero: the language model starts as is.

@@ -3,7 +3,8 @@
 Visual tokens enter LLaMA as a prefix to the text, or as prompts of its layers (``ModelConfig.fusion``).
 """
 
-from typing import Any, cast
+from functools import partial
+from typing import cast
 
 import flax.linen as nn
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 
 from dsvla_jax.model.clip import VisionTower
 from dsvla_jax.model.config import LanguageConfig, ModelConfig
-from dsvla_jax.model.layers import KERNEL_INIT, layer_norm
+from dsvla_jax.model.layers import layer_norm
 from dsvla_jax.model.llama import KVCache, LayerPrompts, Llama, PromptTokens
 from dsvla_jax.model.lora import LoraDense
 from dsvla_jax.model.quantize import quantize
@@ -32,11 +33,12 @@ class Projector(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
+        """x (B, T, vision width) -> (B, T, language width)."""
         width, dtype = self.config.language.width, self.config.compute_dtype
-        options = {"use_bias": True, "dtype": dtype, "kernel_init": KERNEL_INIT}
+        linear = partial(LoraDense, width, use_bias=True, dtype=dtype)
         if self.config.projector == "mlp":
-            x = nn.gelu(LoraDense(width, name="hidden", **options)(x))
-        x = LoraDense(width, name="linear", **options)(x)
+            x = nn.gelu(linear(name="hidden")(x))
+        x = linear(name="linear")(x)
         return layer_norm(1e-5, "norm")(x).astype(dtype)
 
 
@@ -51,6 +53,7 @@ class VLA(nn.Module):
     config: ModelConfig
 
     def setup(self) -> None:
+        """Makes the two towers and what is between them."""
         self.vision = VisionTower(self.config)
         # Both are the paper's projection module, and have one name, under which regimes and checkpoints know it.
         self.projector = VisualPrompt(self.config) if self.config.fusion == "adapter" else Projector(self.config)
@@ -102,9 +105,17 @@ class VLA(nn.Module):
         return self._continue(self.language.embed(tokens), positions, mask, cache, index)
 
     def _continue(
-        self, x: Array, positions: Array, mask: Array, cache: KVCache, index: Array | int, prompts: Any = None
-    ) -> Any:
-        return self.language(x, positions, mask, cache, index, prompts)
+        self,
+        x: Array,
+        positions: Array,
+        mask: Array,
+        cache: KVCache,
+        index: Array | int,
+        prompts: tuple[PromptTokens, LayerPrompts] | None = None,
+    ) -> tuple[Array, KVCache]:
+        x, written = self.language(x, positions, mask, cache, index, prompts)
+        assert written is not None
+        return x, written
 
     def _sequence(self, inputs: ModelInputs) -> tuple[Array, Array, tuple[PromptTokens, LayerPrompts] | None]:
         """What the language model reads: (B, T', width), its positions (1, T'), and the visual prompts if any."""

@@ -6,7 +6,7 @@ The paper's chain (section 3.3) in the Hugging Face models. Thresholds are those
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from dsvla_jax.errors import UserError
 from dsvla_jax.perception.keypoints import ONE_END, OTHER_END, Sighting
 from dsvla_jax.perception.phrases import ObjectPhrases, load_table
 from dsvla_jax.ranges import at_least, check_fields
+
+if TYPE_CHECKING:
+    import transformers  # type: ignore[import-not-found]
 
 DETECTOR = "IDEA-Research/grounding-dino-tiny"
 SEGMENTER = "facebook/sam-vit-huge"
@@ -50,16 +53,15 @@ class GroundingOptions:
 class GroundedSegmenter:
     """A `Segmenter`: for each phrase the best box of Grounding DINO, and SAM's mask in that box.
 
-    detector, segmenter: GroundingDinoForObjectDetection and SamModel, with their processors.
     box_threshold: a phrase whose best box scores less is not found. device: torch's name of it.
     """
 
     def __init__(
         self,
-        detector: Any,
-        detector_processor: Any,
-        segmenter: Any,
-        segmenter_processor: Any,
+        detector: "transformers.GroundingDinoForObjectDetection",
+        detector_processor: "transformers.GroundingDinoProcessor",
+        segmenter: "transformers.SamModel",
+        segmenter_processor: "transformers.SamProcessor",
         box_threshold: float = 0.3,
         device: str = "cpu",
     ) -> None:

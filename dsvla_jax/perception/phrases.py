@@ -9,9 +9,9 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from dsvla_jax.errors import UserError
+from dsvla_jax.json_values import Json
 
 _COLOUR = re.compile(r"\b(?!the\b|stack\b)(\w+) (?:pepper|object|blocks?)\b")
 
@@ -61,10 +61,13 @@ def load_table(path: Path) -> tuple[ObjectPhrases, ...]:
         ) from error
 
 
-def _row(said: str, phrases: Any) -> ObjectPhrases:
+def _row(said: str, phrases: Json) -> ObjectPhrases:
     re.compile(said)
-    arms: list[Any] = phrases if isinstance(phrases, list) and phrases and isinstance(phrases[0], list) else [phrases]
+    arms = phrases if isinstance(phrases, list) and phrases and isinstance(phrases[0], list) else [phrases]
+    rows: list[tuple[str, ...]] = []
     for arm in arms:
-        if not isinstance(arm, list) or not arm or not all(isinstance(phrase, str) and phrase for phrase in arm):
+        words = [phrase for phrase in arm if isinstance(phrase, str) and phrase] if isinstance(arm, list) else []
+        if not words or words != arm:
             raise ValueError(f"{said!r}: expected phrases, got {arm!r}")
-    return ObjectPhrases(said, said, tuple(tuple(arm) for arm in arms))
+        rows.append(tuple(words))
+    return ObjectPhrases(said, said, tuple(rows))

@@ -31,6 +31,7 @@ class Shape:
 
     @property
     def bytes(self) -> int:
+        """Its size in memory."""
         return math.prod(self.dims) * self.bits // 8
 
 
@@ -47,6 +48,7 @@ class Instruction:
     root: bool
 
     def attribute(self, pattern: str) -> str | None:
+        """The first group of a pattern in the attributes; None if it is not there."""
         found = re.search(pattern, self.attributes)
         return found.group(1) if found else None
 

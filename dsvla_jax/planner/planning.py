@@ -7,10 +7,10 @@ import re
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
-from jax.sharding import Mesh, NamedSharding
+import optax
+from jax.sharding import Mesh
 
 from dsvla_jax.encoding.encode import model_inputs
 from dsvla_jax.encoding.grammar import build_answer_grammar
@@ -19,18 +19,17 @@ from dsvla_jax.encoding.text import Tokenizer, WordTokenizer, vocabulary
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.model.decode import Decoded, decode_actions
 from dsvla_jax.model.flops import prefill_flops
-from dsvla_jax.model.partition import shardings
+from dsvla_jax.model.partition import Tree, shardings
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.model.vla import VLA
 from dsvla_jax.planner.hlo import program_cost
-from dsvla_jax.policies.interface import Learner
 from dsvla_jax.policies.networks import make_network
-from dsvla_jax.policies.registry import make_learner
+from dsvla_jax.policies.registry import ConfiguredLearner, make_learner
 from dsvla_jax.policies.traced_flops import product_flops
 from dsvla_jax.training.chips import Chip, Slice
 from dsvla_jax.training.sharding import batch_part, batch_sharding, make_mesh
-from dsvla_jax.training.state import initial_state, jit_train_step, make_optimizer, make_train_step
-from dsvla_jax.types import Array, Picture, PoseInputs, Text
+from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
+from dsvla_jax.types import Array, Example, Picture, PoseExample, PoseInputs, Text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +74,7 @@ def _vocabulary(folder: Path | None) -> Tokenizer:
     return load_tokenizer(folder) if folder is not None and folder.exists() else WordTokenizer(vocabulary(()))
 
 
-def planning_learner(experiment: Experiment) -> Learner[Any, Any]:
+def planning_learner(experiment: Experiment) -> ConfiguredLearner:
     """The experiment's policy as it learns, with the vocabulary of `planning_tokenizer`."""
     tokenizer = planning_tokenizer(experiment)
     return make_learner(
@@ -118,6 +117,7 @@ def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
         return _plan_poses(experiment, where, mesh, examples, state.trainable, frozen)
     grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
     batch = abstract_batch(experiment, mesh)
+    assert isinstance(batch, Example)
     asked = (batch.pictures, batch.text)
 
     def decode(trainable: Variables, frozen: Variables, pictures: Picture[Array], text: Text[Array]) -> Decoded:
@@ -142,7 +142,9 @@ def _plan_poses(
     assert experiment.baseline is not None
     tokenizer = planning_tokenizer(experiment)
     network = make_network(experiment.baseline, experiment.encoding, experiment.model, tokenizer)
-    inputs = abstract_batch(experiment, mesh).inputs
+    batch = abstract_batch(experiment, mesh)
+    assert isinstance(batch, PoseExample)
+    inputs = batch.inputs
 
     def act(trainable: Variables, frozen: Variables, inputs: PoseInputs[Array]) -> Array:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
@@ -164,9 +166,10 @@ def held_bytes(experiment: Experiment, mesh: Mesh) -> int:
     return bytes_on_a_device((state, frozen))
 
 
-def peak_bytes(compiled: Any) -> int:
+def peak_bytes(compiled: jax.stages.Compiled) -> int:
     """Bytes a chip of a compiled program while it runs, by its compiler: arguments, results and temporaries."""
     memory = compiled.memory_analysis()
+    assert memory is not None
     return (
         memory.argument_size_in_bytes
         + memory.output_size_in_bytes
@@ -183,17 +186,24 @@ def roofline(chip: Chip, flops: float, traffic: float, network: float) -> tuple[
 
 
 def _plan(
-    program: str, lowered: Any, where: Slice, mesh: Mesh, examples: int, held: dict[str, int], counted: int
+    program: str,
+    lowered: jax.stages.Lowered,
+    where: Slice,
+    mesh: Mesh,
+    examples: int,
+    held: dict[str, int],
+    counted: int,
 ) -> Plan:
     start = time.monotonic()
-    common: dict[str, Any] = {
-        "program": program,
-        "topology": where.name + (" (virtual CPU devices)" if where.virtual else ""),
-        "mesh": dict(mesh.shape),
-        "examples": examples,
-        "held": held,
-        "counted_flops": counted,
-    }
+    plan = partial(
+        Plan,
+        program=program,
+        topology=where.name + (" (virtual CPU devices)" if where.virtual else ""),
+        mesh=dict(mesh.shape),
+        examples=examples,
+        held=held,
+        counted_flops=counted,
+    )
     try:
         compiled = lowered.compile()
     except jax.errors.JaxRuntimeError as error:
@@ -201,15 +211,16 @@ def _plan(
         if needed is None:
             raise
         seconds = time.monotonic() - start
-        return Plan(
-            **common, temporary=None, peak=needed, fits=False, flops=0, traffic=0, collectives={},
+        return plan(
+            temporary=None, peak=needed, fits=False, flops=0, traffic=0, collectives={},
             seconds=(math.inf, math.inf), compile_seconds=seconds,
         )  # fmt: skip
     seconds = time.monotonic() - start
-    memory, peak = compiled.memory_analysis(), peak_bytes(compiled)
-    cost = program_cost(compiled.as_text())
-    return Plan(
-        **common,
+    memory, peak, text = compiled.memory_analysis(), peak_bytes(compiled), compiled.as_text()
+    assert memory is not None
+    assert text is not None
+    cost = program_cost(text)
+    return plan(
         temporary=memory.temp_size_in_bytes,
         peak=peak,
         fits=peak <= where.chip.memory,
@@ -228,7 +239,7 @@ def needed_bytes(message: str) -> int | None:
     return int(float(found[1]) * 2 ** {"K": 10, "M": 20, "G": 30}[found[2]]) if found else None
 
 
-def abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[Any, Any, Any]:
+def abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[TrainState, Variables, optax.GradientTransformation]:
     """State and frozen variables as shapes with shardings, and the optimizer."""
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
     start = partial(
@@ -244,7 +255,7 @@ def abstract_state(experiment: Experiment, mesh: Mesh) -> tuple[Any, Any, Any]:
     return *_placed((state, frozen), shardings((state, frozen), mesh)), optimizer
 
 
-def abstract_batch(experiment: Experiment, mesh: Mesh, picture: tuple[int, int] | None = None) -> Any:
+def abstract_batch(experiment: Experiment, mesh: Mesh, picture: tuple[int, int] | None = None) -> object:
     """Returns a batch of examples as shapes with shardings.
 
     picture: height and width, those of simulated demonstrations if not given.
@@ -255,15 +266,15 @@ def abstract_batch(experiment: Experiment, mesh: Mesh, picture: tuple[int, int] 
     return _placed(batch, jax.tree.map(lambda _: batch_sharding(mesh), batch))
 
 
-def _placed(tree: Any, where: Any) -> Any:
+def _placed(tree: Tree, where: object) -> Tree:
     return jax.tree.map(lambda leaf, sharding: leaf.update(sharding=sharding), tree, where)
 
 
-def bytes_on_a_device(tree: Any) -> int:
+def bytes_on_a_device(tree: object) -> int:
     """Of a tree of shapes with shardings, what each device holds."""
 
-    def size(leaf: Any) -> int:
-        sharding: NamedSharding = leaf.sharding
-        return math.prod(sharding.shard_shape(leaf.shape)) * leaf.dtype.itemsize
+    def size(leaf: jax.ShapeDtypeStruct) -> int:
+        assert leaf.sharding is not None
+        return math.prod(leaf.sharding.shard_shape(leaf.shape)) * leaf.dtype.itemsize
 
     return sum(map(size, jax.tree.leaves(tree)))

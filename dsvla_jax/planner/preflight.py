@@ -3,9 +3,10 @@
 import math
 import os
 from collections.abc import Iterator
-from typing import Any
 
 import jax
+import jax.core
+import jax.extend.core
 from jax.sharding import Mesh
 
 from dsvla_jax.errors import UserError
@@ -34,7 +35,7 @@ def check_step(experiment: Experiment, mesh: Mesh, picture: tuple[int, int]) -> 
 
     learner = planning_learner(experiment)
 
-    def loss(trainable: Variables, frozen: Variables, batch: Any) -> Array:
+    def loss(trainable: Variables, frozen: Variables, batch: object) -> Array:
         return learner.loss(join_variables(trainable, frozen), batch, learner.totals(batch), jax.random.key(0))[0]
 
     largest = max(_outputs(jax.make_jaxpr(loss)(state.trainable, frozen, batch).jaxpr), key=_bytes)
@@ -57,20 +58,21 @@ def device_memory() -> float:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / len(devices)
 
 
-def _outputs(jaxpr: Any) -> Iterator[Any]:
+def _outputs(jaxpr: jax.extend.core.Jaxpr) -> Iterator[jax.core.ShapedArray]:
     """The shapes of all that a program computes, inner programs included."""
     for equation in jaxpr.eqns:
-        yield from (variable.aval for variable in equation.outvars if hasattr(variable.aval, "shape"))
+        avals = (variable.aval for variable in equation.outvars)
+        yield from (aval for aval in avals if isinstance(aval, jax.core.ShapedArray))
         for parameter in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
             if _is_program(parameter):
                 yield from _outputs(getattr(parameter, "jaxpr", parameter))
 
 
-def _is_program(value: Any) -> bool:
-    return hasattr(value, "eqns") or hasattr(getattr(value, "jaxpr", None), "eqns")
+def _is_program(value: object) -> bool:
+    return isinstance(value, (jax.extend.core.Jaxpr, jax.extend.core.ClosedJaxpr))
 
 
-def _bytes(aval: Any) -> int:
+def _bytes(aval: jax.core.ShapedArray) -> int:
     return math.prod(aval.shape) * getattr(aval.dtype, "itemsize", 4)
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from dsvla_jax.encoding.number_targets import NumberTargets
+from dsvla_jax.policies.interface import Metrics
 from dsvla_jax.types import Array, Example
 
 
@@ -19,7 +20,7 @@ def answer_loss(
     batch: Example[Array],
     targets: NumberTargets,
     counts: tuple[Array, Array] | None = None,
-) -> tuple[Array, dict[str, Array]]:
+) -> tuple[Array, Metrics]:
     """Mean cross-entropy over all answer tokens of the batch, each predicted from the token before it.
 
     targets: of the tokenizer and style that the batch was written with; `batch.number_rows` are rows of it.

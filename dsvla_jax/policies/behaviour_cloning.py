@@ -37,6 +37,7 @@ class PoseHead(nn.Module):
 
     @nn.compact
     def __call__(self, hidden: Array, robot: Array) -> Vectors:
+        """The vectors of the upcoming keyframes."""
         outputs = self.upcoming * ARMS * VECTOR
         x = jnp.concatenate([hidden.astype(jnp.float32), with_waves(robot)], axis=-1)
         for name in ("first", "second"):
@@ -53,6 +54,7 @@ class PoseVLA(VLA):
     head_width: int = 256
 
     def setup(self) -> None:
+        """Makes the head beside the trunk."""
         super().setup()
         self.pose_head = PoseHead(self.upcoming, self.head_width)
 

@@ -5,7 +5,7 @@ Training knows a `Learner`; evaluation on the host, serving and the demo know a 
 """
 
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeAlias, TypeVar
 
 import jax
 import numpy as np
@@ -22,6 +22,9 @@ HeldOutT = TypeVar("HeldOutT", contravariant=True)
 AnswerT = TypeVar("AnswerT")
 QuestionT = TypeVar("QuestionT")
 Tree = TypeVar("Tree")
+
+Metrics: TypeAlias = dict[str, Array]
+"""float32 () by name; which there are depends on the policy."""
 
 # Batches are filled up to one of these sizes, so that any size runs without compiling again; beyond, to a multiple of
 # the last.
@@ -49,7 +52,7 @@ class Learner(Protocol[ExampleT, HeldOutT]):
 
     def loss(
         self, variables: Variables, part: ExampleT, totals: tuple[Array, ...], key: Array
-    ) -> tuple[Array, dict[str, Array]]:
+    ) -> tuple[Array, Metrics]:
         """The loss of a part of a batch, and metrics by name, "loss" among them.
 
         totals: of the whole batch, so that the sums over its parts are the whole batch's loss and metrics.

@@ -18,7 +18,7 @@ from dsvla_jax.encoding.text import Tokenizer, require_known_words
 from dsvla_jax.geometry.rotations import rotation_distance
 from dsvla_jax.model.variables import Regime, Variables
 from dsvla_jax.policies.config import PolicyConfig
-from dsvla_jax.policies.interface import Decision, filled_up
+from dsvla_jax.policies.interface import Decision, Metrics, filled_up
 from dsvla_jax.policies.networks import make_network
 from dsvla_jax.policies.pose_network import PoseNetwork, Vectors
 from dsvla_jax.policies.pose_vectors import from_vectors, to_vectors
@@ -51,7 +51,7 @@ class PoseLearner:
 
     def loss(
         self, variables: Variables, part: PoseExample[Array], totals: tuple[Array, ...], key: Array
-    ) -> tuple[Array, dict[str, Array]]:
+    ) -> tuple[Array, Metrics]:
         """See `Learner`. Where answers cost nothing, their errors are among the metrics."""
         (count,), there = totals, part.inputs.arms
         target = target_vectors(part, self.encoding.codec)

@@ -13,6 +13,9 @@ from dsvla_jax.policies.networks import make_network
 from dsvla_jax.policies.pose_policy import PoseLearner, PosePolicy
 from dsvla_jax.policies.three_ds_vla import TextPolicy, text_learner
 
+ConfiguredLearner = Learner[Any, Any]
+"""A learner whose kind of examples the config decides, which no annotation can know."""
+
 
 def make_learner(
     baseline: Baseline | None,
@@ -21,7 +24,7 @@ def make_learner(
     tokenizer: Tokenizer,
     soft_target_sigma: float = 0.0,
     cameras: int = 1,
-) -> Learner[Any, Any]:
+) -> ConfiguredLearner:
     """How a policy learns, from examples of its own kind.
 
     baseline: None for 3DS-VLA. soft_target_sigma: see `text_learner`. cameras: C, in examples.

@@ -27,7 +27,7 @@ from dsvla_jax.model.vla import VLA, initialize
 from dsvla_jax.policies.answer_errors import guess_integers, number_errors
 from dsvla_jax.policies.answer_loss import answer_counts, answer_loss
 from dsvla_jax.policies.config import PolicyConfig
-from dsvla_jax.policies.interface import Decision, filled_up
+from dsvla_jax.policies.interface import Decision, Metrics, filled_up
 from dsvla_jax.types import Action, Array, Example, HeldOutExample, Observation, RobotState, Text
 
 # Prompts are padded to a multiple of it.
@@ -64,7 +64,7 @@ class TextLearner:
 
     def loss(
         self, variables: Variables, part: Example[Array], totals: tuple[Array, ...], key: Array
-    ) -> tuple[Array, dict[str, Array]]:
+    ) -> tuple[Array, Metrics]:
         """See `Learner` and `answer_loss`."""
         tokens, bins = totals
         return answer_loss(self.logits(variables, part, key), part, self.targets, (tokens, bins))

@@ -3,13 +3,14 @@
 import contextlib
 import socket
 import threading
-from typing import Any, NoReturn
+from typing import NoReturn, cast
 
+import numpy as np
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from dsvla_jax.errors import UserError
-from dsvla_jax.serving.messages import MessageError, pack, unpack
+from dsvla_jax.serving.messages import Message, MessageError, pack, unpack
 
 _START = "start a server (python -m dsvla_jax.serving RUN), or give another host and port"
 _AGAIN = (
@@ -54,7 +55,7 @@ class PolicyClient:
         self._socket = self._connect(token)
         self.metadata = self._receive_metadata()
 
-    def infer(self, observation: dict[str, Any]) -> dict[str, Any]:
+    def infer(self, observation: Message) -> Message:
         """The reply to one request.
 
         Raises ServerError with the server's message if it refuses the request, and ConnectionFailed if no reply comes
@@ -63,7 +64,8 @@ class PolicyClient:
         request = pack(observation)
         most = self.metadata.get("max_message_bytes", len(request))
         if len(request) > most:
-            kinds = ", ".join(f"{key} {value.dtype}" for key, value in observation.items() if hasattr(value, "dtype"))
+            arrays = {key: value for key, value in observation.items() if isinstance(value, np.ndarray | np.generic)}
+            kinds = ", ".join(f"{key} {value.dtype}" for key, value in arrays.items())
             raise UserError(
                 f"request: {len(request):,} bytes are more than the {most:,} that {self.address} takes; send pictures"
                 f" of {self.metadata.get('image_sizes')}, rgb as uint8 and depth as float32 (got {kinds})"
@@ -88,7 +90,7 @@ class PolicyClient:
                 alarm.cancel()
         if isinstance(reply, str):
             raise ServerError(reply)
-        return unpack(reply)
+        return cast(Message, unpack(reply))
 
     def close(self) -> None:
         """Ends the connection."""
@@ -142,7 +144,7 @@ class PolicyClient:
             + fix.get(status, f"expected a policy server there: {_START}")
         ) from error
 
-    def _receive_metadata(self) -> dict[str, Any]:
+    def _receive_metadata(self) -> Message:
         try:
             received = self._socket.recv(self._timeout)
             metadata = unpack(received) if isinstance(received, bytes) else received

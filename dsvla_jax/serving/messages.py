@@ -6,28 +6,34 @@ read can execute, and what may be read is bounded before it is built.
 """
 
 import math
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import msgpack
 import numpy as np
 
 from dsvla_jax.errors import UserError
 
+Container = TypeVar("Container")
+
 MAX_CONTAINERS = 512  # maps and lists in a message: an empty one costs one byte to send and sixty to hold
 MAX_DIMENSIONS = 8
 _KINDS = "biuf"  # bool, integers, floats
+
+Message: TypeAlias = dict[str, Any]
+"""A map of plain values and NumPy arrays by field: the wire has no types. `requests.parse_request` checks what a robot
+sends; what a server sends is described in docs/serving.md."""
 
 
 class MessageError(UserError):
     """Bytes that are not a message of this format, or one beyond its limits."""
 
 
-def pack(value: Any) -> bytes:
+def pack(value: object) -> bytes:
     """Plain values, NumPy arrays and scalars as bytes. Raises TypeError on anything else."""
     return msgpack.Packer(default=_encode).pack(value)
 
 
-def unpack(data: bytes) -> Any:
+def unpack(data: bytes) -> object:
     """The value that `pack`, or openpi-client's packer, wrote. Arrays are read-only views of ``data``.
 
     Raises MessageError on anything that is not such a message, more than `MAX_CONTAINERS` maps and lists, more than
@@ -35,7 +41,7 @@ def unpack(data: bytes) -> Any:
     """
     counted = 0
 
-    def count(container: Any) -> Any:
+    def count(container: Container) -> Container:
         nonlocal counted
         counted += 1
         if counted > MAX_CONTAINERS:
@@ -58,7 +64,7 @@ def unpack(data: bytes) -> Any:
         raise MessageError(f"message: expected msgpack of plain values and NumPy arrays ({why})") from error
 
 
-def _encode(value: Any) -> Any:
+def _encode(value: object) -> dict[bytes, object]:
     if isinstance(value, np.ndarray) and value.dtype.kind in _KINDS:
         return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
     if isinstance(value, np.generic) and value.dtype.kind in _KINDS:
@@ -66,7 +72,7 @@ def _encode(value: Any) -> Any:
     raise TypeError(f"message: cannot send {type(value).__name__}; expected plain values and arrays of numbers")
 
 
-def _decode(pairs: dict) -> Any:
+def _decode(pairs: dict) -> dict | np.ndarray | np.generic:
     if b"__ndarray__" in pairs:
         dtype, shape, data = _dtype(pairs), pairs.get(b"shape"), pairs.get(b"data")
         if not (

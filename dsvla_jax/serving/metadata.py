@@ -1,12 +1,12 @@
 """What a server says of itself on connecting: what the policy wants, because it learned from it."""
 
 import dataclasses
-from typing import Any
 
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.text import WordTokenizer
 from dsvla_jax.policies.config import PolicyConfig
 from dsvla_jax.policies.interface import Policy
+from dsvla_jax.serving.messages import Message
 from dsvla_jax.serving.requests import Expected
 from dsvla_jax.types import TABLE_HEIGHT
 
@@ -24,7 +24,7 @@ def camera_names(config: PolicyConfig) -> tuple[str, ...]:
     return names if len(names) == count else tuple(f"camera {number}" for number in range(count))
 
 
-def describe(name: str, policy: Policy, expected: Expected, finds_keypoints: bool) -> dict[str, Any]:
+def describe(name: str, policy: Policy, expected: Expected, finds_keypoints: bool) -> Message:
     """The metadata. finds_keypoints: whether the server looks for those of robots that send none."""
     config, learned = policy.config, policy.config.learned_from
     several = {"cameras": list(expected.cameras)} if len(expected.cameras) > 1 else {}
@@ -54,7 +54,7 @@ def describe(name: str, policy: Policy, expected: Expected, finds_keypoints: boo
     }
 
 
-def _describe_learned(learned: LearnedFrom) -> dict[str, Any]:
+def _describe_learned(learned: LearnedFrom) -> Message:
     """The fields; a single camera as `camera`, empty if its name is not known."""
     fields = dataclasses.asdict(learned)
     if len(learned.cameras) <= 1:

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -116,7 +115,7 @@ class Request:
         return (len(self.observation.robot.pose), *self.observation.pictures.rgb.shape[1:3])
 
 
-def parse_request(message: Any, expected: Expected) -> Request:
+def parse_request(message: object, expected: Expected) -> Request:
     """Checks and converts one message. What recordings refuse is refused here too.
 
     Raises BadRequest naming the field, what was expected, what came and the fix.
@@ -151,7 +150,7 @@ def check_first_keypoints(request: Request, keypoints: np.ndarray) -> None:
         raise BadRequest(str(error)) from error
 
 
-def _parse(message: Any, expected: Expected) -> Request:
+def _parse(message: object, expected: Expected) -> Request:
     if not isinstance(message, dict):
         raise BadRequest(f"request: expected a map with {', '.join(expected.required)}, got {type(message).__name__}")
     unknown = sorted(repr(key)[:40] for key in message if key not in FIELDS and key not in OPTIONAL_FIELDS)
@@ -204,11 +203,11 @@ def _pictures(message: dict, expected: Expected) -> tuple[Picture[np.ndarray], i
     rgb = _rgb(message["rgb"], expected)
     count, *size = rgb.shape[:3]
     if "depth" not in message:
-        blank: Any = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
+        blank = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
         return Picture(rgb, np.zeros((count, *size), np.float32), Camera(blank[:, :3, :3], blank)), None
     fields = expected.fields
 
-    def of_cameras(name: str, shape: tuple[int, ...], finite: bool = True) -> Any:
+    def of_cameras(name: str, shape: tuple[int, ...], finite: bool = True) -> np.ndarray:
         axis = (count,) if len(expected.cameras) > 1 else ()
         return _floats(message, name, (*axis, *shape), finite, fields[name]).reshape(count, *shape)
 
@@ -224,7 +223,7 @@ def _pictures(message: dict, expected: Expected) -> tuple[Picture[np.ndarray], i
     return pictures, _count_points(pictures, expected.encoding) if expected.encoding.use_points else None
 
 
-def _rgb(rgb: Any, expected: Expected) -> np.ndarray:
+def _rgb(rgb: object, expected: Expected) -> np.ndarray:
     """uint8 (C, H, W, 3)."""
     count = len(expected.cameras)
     axis = "" if count == 1 else f"{count}, "
@@ -272,7 +271,9 @@ def _count_points(pictures: Picture[np.ndarray], encoding: EncodingConfig) -> in
     return points
 
 
-def _floats(message: dict, name: str, shape: tuple[int | None, ...], finite: bool = True, described: str = "") -> Any:
+def _floats(
+    message: dict, name: str, shape: tuple[int | None, ...], finite: bool = True, described: str = ""
+) -> np.ndarray:
     what, value = described or {**FIELDS, **OPTIONAL_FIELDS}[name], message[name]
     if not isinstance(value, np.ndarray | list):
         raise BadRequest(f"{name}: expected {what}, got {_describe(value)}")
@@ -300,7 +301,7 @@ def _check_inside(name: str, positions: np.ndarray, codec: PoseCodec) -> None:
         )
 
 
-def _describe(value: Any) -> str:
+def _describe(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {value.shape}"
     if isinstance(value, str):

@@ -11,9 +11,8 @@ import hmac
 import http
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -37,7 +36,7 @@ from dsvla_jax.serving.batching import (
     blank_question,
     prompt_length,
 )
-from dsvla_jax.serving.messages import pack, unpack
+from dsvla_jax.serving.messages import Message, pack, unpack
 from dsvla_jax.serving.metadata import camera_names, describe
 from dsvla_jax.serving.metrics import Metrics
 from dsvla_jax.serving.requests import (
@@ -135,12 +134,12 @@ class PolicyServer:
         self._clients = 0
 
     @property
-    def metadata(self) -> dict[str, Any]:
+    def metadata(self) -> Message:
         """What a robot is told on connecting."""
         return describe(self._name, self._policy, self.expected, self._perception is not None)
 
     @contextlib.asynccontextmanager
-    async def listen(self, host: str = "127.0.0.1", port: int = 8000):
+    async def listen(self, host: str = "127.0.0.1", port: int = 8000) -> AsyncIterator[Server]:
         """Listens, compiles everything, then lets requests in. Yields the websockets server, ready."""
         seconds = self.limits.message_seconds
         async with contextlib.AsyncExitStack() as stack:
@@ -254,7 +253,7 @@ class PolicyServer:
 
     async def _receive(self, connection: ServerConnection) -> str | bytes:
         """The next message, which may take long to begin, but not to arrive."""
-        fragments: list[Any] = []
+        fragments: list[str | bytes] = []
         try:
             async with asyncio.timeout(self.limits.idle_seconds) as limit:
                 async for fragment in connection.recv_streaming():
@@ -266,7 +265,8 @@ class PolicyServer:
         except TimeoutError as error:
             what = "a message took too long to arrive" if fragments else "no request for too long"
             raise TimeoutError(what) from error
-        return ("" if isinstance(fragments[0], str) else b"").join(fragments)
+        text = [fragment for fragment in fragments if isinstance(fragment, str)]
+        return "".join(text) if text else b"".join(part for part in fragments if not isinstance(part, str))
 
     async def _reply(self, message: str | bytes, session: Session, previous: float | None) -> tuple[str, str | bytes]:
         """(outcome for the metrics, frame to send)."""
@@ -346,7 +346,7 @@ def _reply_map(
     reached: np.ndarray | None,
     points: int | None,
     previous: float | None,
-) -> dict[str, Any]:
+) -> Message:
     # Arrays have the length of an action chunk in front, because openpi's ActionChunkBroker indexes every array by it.
     server_timing = {
         "infer_ms": timing.answering * 1000,

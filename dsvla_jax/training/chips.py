@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Protocol
 
 import jax
 from jax.experimental import topologies
@@ -52,7 +52,13 @@ PEAK_FLOPS = {
 }
 
 
-def peak_flops(devices: Sequence[Any]) -> float | None:
+class Device(Protocol):
+    """What is read of JAX's devices, whose class has no types."""
+
+    device_kind: str
+
+
+def peak_flops(devices: Sequence[Device]) -> float | None:
     """bfloat16 products a second of all devices together, as published; None where one of them is not known."""
     peaks = [PEAK_FLOPS.get(device.device_kind) for device in devices]
     return sum(known) if len(known := [peak for peak in peaks if peak is not None]) == len(peaks) else None
@@ -64,7 +70,7 @@ class Slice:
 
     name: str
     chip: Chip
-    devices: tuple[Any, ...]
+    devices: tuple[Device, ...]
     virtual: bool
 
 

@@ -15,7 +15,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import jax
 import numpy as np
@@ -30,7 +30,16 @@ EXPLICIT = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 PEER_FAILED = 75
 
 
-def launch_arguments(environment: Mapping[str, str]) -> dict[str, Any] | None:
+class LaunchArguments(TypedDict, total=False):
+    """Arguments of ``jax.distributed.initialize``: either the first three, or the last."""
+
+    coordinator_address: str
+    num_processes: int
+    process_id: int
+    cluster_detection_method: str
+
+
+def launch_arguments(environment: Mapping[str, str]) -> LaunchArguments | None:
     """Arguments of ``jax.distributed.initialize``; None for a program that runs alone.
 
     The three ``EXPLICIT`` variables say who takes part (cluster/jobset.yaml sets them); a Slurm step of several tasks
@@ -95,7 +104,7 @@ class Watchdog:
         self._index, self._count = jax.process_index(), jax.process_count()
         # Files of an earlier job in the same folder mean nothing: all processes agree on a number for this one.
         job = int(multihost_utils.broadcast_one_to_all(np.int32(time.time() % 2**31))) if self._count > 1 else 0
-        self._note: dict[str, Any] = {"job": job, "host": socket.gethostname(), "doing": "starting", "error": ""}
+        self._note: dict[str, object] = {"job": job, "host": socket.gethostname(), "doing": "starting", "error": ""}
         self._since: float | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)

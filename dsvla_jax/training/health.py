@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -26,9 +25,9 @@ class SkippedSteps:
 
     def __init__(self, folder: Path, limit: int, seen: int) -> None:
         self._folder, self._limit, self._seen = folder, limit, seen
-        self._pending: tuple[int, Any, Array] | None = None
+        self._pending: tuple[int, object, Array] | None = None
 
-    def watch(self, step: int, batch: Any, total: Array) -> None:
+    def watch(self, step: int, batch: object, total: Array) -> None:
         """batch: this process's part, on the host. total: int32 (), skipped steps up to and with this one."""
         self.settle()
         self._pending = (step, batch, total)

@@ -6,13 +6,16 @@ import os
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 from tensorboardX import SummaryWriter
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.files import replacing
+
+if TYPE_CHECKING:
+    import wandb  # pyright: ignore[reportMissingImports]
 
 FILE = "metrics.jsonl"
 
@@ -25,7 +28,9 @@ class MetricsWriter:
     step: that of the checkpoint, or 0. wandb_project: the Weights & Biases project to write to as well, if any.
     """
 
-    def __init__(self, run: Path, step: int, wandb_project: str = "", config: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, run: Path, step: int, wandb_project: str = "", config: Mapping[str, object] | None = None
+    ) -> None:
         writes = jax.process_index() == 0
         self._path = run / FILE if writes else Path(os.devnull)
         if writes:
@@ -91,7 +96,7 @@ def require_wandb() -> None:
         raise UserError("--wandb: the package is not installed; install it with: pip install wandb") from error
 
 
-def _start_wandb(run: Path, project: str, config: Mapping[str, Any]) -> Any:
+def _start_wandb(run: Path, project: str, config: Mapping[str, object]) -> "wandb.Run":
     require_wandb()
     import wandb  # pyright: ignore[reportMissingImports]
 

@@ -3,12 +3,12 @@
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 from tqdm import tqdm
 
 from dsvla_jax.training.loop import Step
+from dsvla_jax.training.state import TrainState
 
 # The first call compiles, and the second may wait for what the first has left behind.
 FIRST = 3
@@ -29,7 +29,7 @@ def trace_steps(step: Step, folder: Path, count: int) -> Iterator[Step]:
                 "at https://ui.perfetto.dev)"
             )
 
-    def traced(state: Any, batch: Any) -> Any:
+    def traced(state: TrainState, batch: object) -> tuple[TrainState, dict[str, object]]:
         nonlocal calls, tracing
         calls += 1
         if count and calls == FIRST:

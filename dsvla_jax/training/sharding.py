@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -10,12 +9,11 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import MeshConfig
-from dsvla_jax.model.partition import AXIS_RULES, MESH_AXES
+from dsvla_jax.model.partition import AXIS_RULES, MESH_AXES, Tree
+from dsvla_jax.training.chips import Device
 
-Tree = TypeVar("Tree")
 
-
-def make_mesh(config: MeshConfig, devices: Sequence[Any] | None = None) -> Mesh:
+def make_mesh(config: MeshConfig, devices: Sequence[Device] | None = None) -> Mesh:
     """The mesh over these devices, all there are by default."""
     shape = config.shape(jax.device_count() if devices is None else len(devices))
     return jax.make_mesh(shape, MESH_AXES, axis_types=(AxisType.Auto,) * 3, devices=devices)

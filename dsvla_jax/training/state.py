@@ -1,7 +1,7 @@
 """The training step as a pure function, and the state that it carries."""
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Never, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from dsvla_jax.model.variables import (
     narrow_frozen,
     split_variables,
 )
-from dsvla_jax.policies.interface import Learner
+from dsvla_jax.policies.interface import Learner, Metrics
 from dsvla_jax.types import Array
 
 
@@ -48,11 +48,11 @@ class TrainState:
 
 Example = TypeVar("Example")
 Summed = TypeVar("Summed")
-TrainStep = Callable[[TrainState, Variables, Example], tuple[TrainState, dict[str, Array]]]
+TrainStep = Callable[[TrainState, Variables, Example], tuple[TrainState, Metrics]]
 
 
 def initial_state(
-    learner: Learner,
+    learner: Learner[Never, Never],
     optimizer: optax.GradientTransformation,
     seed: int,
     regime: Regime,
@@ -107,7 +107,7 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
 
 
 def make_train_step(
-    learner: Learner[Example, Any],
+    learner: Learner[Example, Never],
     optimizer: optax.GradientTransformation,
     accumulation: int = 1,
     average_decay: float = 0.0,
@@ -119,13 +119,13 @@ def make_train_step(
     accumulation: parts in which a batch is computed. average_decay: of the state's moving average, see `average_with`.
     """
 
-    def step(state: TrainState, frozen: Variables, batch: Example) -> tuple[TrainState, dict[str, Array]]:
+    def step(state: TrainState, frozen: Variables, batch: Example) -> tuple[TrainState, Metrics]:
         totals, key = learner.totals(batch), jax.random.fold_in(state.rng, state.step)
 
-        def part(batch: Example) -> tuple[Variables, dict[str, Array]]:
+        def part(batch: Example) -> tuple[Variables, Metrics]:
             batch = jax.tree.map(lambda leaf: constrain(leaf, "batch"), batch)
 
-            def loss_of(trainable: Variables) -> tuple[Array, dict[str, Array]]:
+            def loss_of(trainable: Variables) -> tuple[Array, Metrics]:
                 return learner.loss(join_variables(trainable, frozen), batch, totals, key)
 
             gradients, metrics = jax.grad(loss_of, has_aux=True)(state.trainable)
@@ -158,7 +158,7 @@ def average_with(average: Variables, trainable: Variables, step: Array, decay: f
     return jax.tree.map(lambda mean, new: kept * mean + (1 - kept) * new, average, trainable)
 
 
-def gradient_norms(gradients: Variables) -> dict[str, Array]:
+def gradient_norms(gradients: Variables) -> Metrics:
     """The norm of the whole gradient, and that of each part of the network, the adapters being parts of their own."""
     parts = {
         f"gradient_norm/{name if collection == 'params' else f'{collection}/{name}'}": optax.tree.norm(part)
@@ -168,10 +168,10 @@ def gradient_norms(gradients: Variables) -> dict[str, Array]:
     return {"gradient_norm": jnp.sqrt(sum(norm**2 for norm in parts.values())), **parts}
 
 
-def jit_train_step(step: TrainStep[Example], state: TrainState, mesh: Mesh) -> Any:
+def jit_train_step(step: TrainStep[Example], state: TrainState, mesh: Mesh) -> jax.stages.Wrapped:
     """The step compiled for a mesh. The state stays split as it is, and its memory is used for the next one."""
 
-    def on_mesh(state: TrainState, frozen: Variables, batch: Example) -> tuple[TrainState, dict[str, Array]]:
+    def on_mesh(state: TrainState, frozen: Variables, batch: Example) -> tuple[TrainState, Metrics]:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
             return step(state, frozen, batch)
 

@@ -1,7 +1,7 @@
 """How near a policy comes to held-out demonstrations while it is trained."""
 
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Never, TypeVar
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from dsvla_jax.types import Array
 HeldOut = TypeVar("HeldOut")
 
 
-def jit_validation(learner: Learner[Any, HeldOut], mesh: Mesh) -> Any:
+def jit_validation(learner: Learner[Never, HeldOut], mesh: Mesh) -> jax.stages.Wrapped:
     """Compiles ``sums(trainable, frozen, batch, key)``, `Learner.errors`, for a mesh. `mean_errors` takes the means."""
 
     def sums(trainable: Variables, frozen: Variables, batch: HeldOut, key: Array) -> dict[str, tuple[Array, Array]]:
@@ -28,7 +28,7 @@ def jit_validation(learner: Learner[Any, HeldOut], mesh: Mesh) -> Any:
 
 
 def mean_errors(
-    sums: Any, trainable: Variables, frozen: Variables, batches: Iterable[HeldOut], mesh: Mesh
+    sums: jax.stages.Wrapped, trainable: Variables, frozen: Variables, batches: Iterable[object], mesh: Mesh
 ) -> dict[str, float]:
     """Returns the means over all batches, each named "validation/" and as `Learner.errors` names it.
 
