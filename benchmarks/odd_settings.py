@@ -152,6 +152,7 @@ def train_group(experiment: Experiment, group: Group, folder: Path, bar: tqdm) -
     if outcome == TRAINED or len(group) == 1:
         bar.update(len(group))
         return dict.fromkeys(group, outcome)
+    tqdm.write(f"of {len(group)} values from {group[0].name} on, one does not train: {outcome.splitlines()[-1]}")
     middle = len(group) // 2
     return train_group(experiment, group[:middle], folder, bar) | train_group(experiment, group[middle:], folder, bar)
 
