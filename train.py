@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import tyro
@@ -26,9 +26,10 @@ from dsvla_jax.command_line import configure_jax, fail_with_message, keep_freed_
 from dsvla_jax.evaluation.while_training import measure_success
 from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.partition import make_sharded
-from dsvla_jax.model.variables import join_variables
+from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.planner.preflight import check_step
 from dsvla_jax.policies.config import PolicyConfig
+from dsvla_jax.policies.interface import Metrics
 from dsvla_jax.policies.registry import make_learner, make_policy
 from dsvla_jax.policy import save_policy_config
 from dsvla_jax.ranges import require
@@ -115,7 +116,7 @@ def train(
     train_step = make_train_step(learner, optimizer, experiment.gradient_accumulation, average)
     compiled = jit_train_step(train_step, state, mesh)
 
-    def step(state: TrainState, batch: Any) -> tuple[TrainState, dict[str, Any]]:
+    def step(state: TrainState, batch: object) -> tuple[TrainState, Metrics]:
         return compiled(state, frozen, put_batch(batch, mesh))
 
     sums = jit_validation(learner, mesh)
@@ -151,7 +152,7 @@ def train(
         )
 
 
-def report_size(trainable: Any, frozen: Any, samples: int) -> None:
+def report_size(trainable: Variables, frozen: Variables, samples: int) -> None:
     """Prints what will be trained."""
     learn, rest = (sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (trainable, frozen))
     print(f"{learn:,} trainable and {rest:,} frozen parameters; {samples:,} samples")

@@ -45,6 +45,8 @@ def shift_world(frame: Frame, offset: np.ndarray) -> Frame:
         pictures=replace(frame.pictures, camera=camera),
         robot=replace(frame.robot, pose=_move(frame.robot.pose, offset)),
         target=replace(frame.target, pose=_move(frame.target.pose, offset)),
+        past=frame.past
+        and replace(frame.past, robot=replace(frame.past.robot, pose=_move(frame.past.robot.pose, offset))),
         later=frame.later and replace(frame.later, pose=_move(frame.later.pose, offset)),
         keypoint=frame.keypoint + offset,
     )

@@ -4,7 +4,7 @@ import json
 import operator
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Generic, SupportsIndex, TypeVar
+from typing import Generic, SupportsIndex, TypeVar, cast
 
 import grain
 import numpy as np
@@ -42,9 +42,9 @@ class EpisodeLoader(Iterator[Sample], Generic[Sample]):
     def __next__(self) -> Sample:
         return next(self._batches)
 
-    def get_state(self) -> dict[str, object]:
+    def get_state(self) -> dict[str, Json]:
         """JSON: the position, which counts batches, and the demonstrations that it is in (`EpisodeReader.contents`)."""
-        return {"position": self._batches.get_state(), "data": self._contents}
+        return {"position": self._batches.get_state(), "data": cast(Json, self._contents)}
 
     def set_state(self, state: dict[str, Json]) -> None:
         """Continues from a position. Raises DataError if it was saved with other demonstrations than these.

@@ -31,7 +31,7 @@ def make_pose_sampler(
             grippers = np.concatenate([grippers, frame.later.gripper_open])
         places = np.minimum(np.arange(upcoming), len(poses) - 1)
         return PoseExample(
-            pose_inputs(frame.pictures, frame.robot, text, keypoints),
+            pose_inputs(frame.pictures, frame.robot, text, keypoints, frame.past),
             with_two_arms(poses[places], axis=1),
             with_two_arms(grippers[places], axis=1),
         )

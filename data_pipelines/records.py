@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from dsvla_jax.encoding.past import recorded_past
 from dsvla_jax.errors import DataError
 from dsvla_jax.observation_checks import MAX_DEPTH
-from dsvla_jax.types import Action, Camera, Picture, RobotState
+from dsvla_jax.types import Action, Camera, Past, Picture, RobotState
 
 RECORD_VERSION = 1
 DEPTH_UNIT = 1e-4
@@ -97,6 +98,8 @@ class Frame:
     """The episode's number in the reader's order."""
     frame: int
     """The frame's number in its episode."""
+    past: Past[np.ndarray] | None = None
+    """What the episode was before; None where nobody knows it."""
     later: Action[np.ndarray] | None = None
     """The keyframes behind the next one, (R, A, 7), R of 0 or more; None where nobody knows them."""
 
@@ -317,5 +320,6 @@ def decode_frame(episode: Episode, place: int, task_index: int = 0, episode_numb
         task_index=task_index,
         episode=episode_number,
         frame=place,
+        past=recorded_past(episode.pose, episode.gripper_open, place),
         later=Action(episode.target_pose[place + 1 :].copy(), episode.target_gripper[place + 1 :].copy()),
     )

@@ -9,7 +9,7 @@ An array dimension has one letter everywhere:
     p  points of a cloud                              g  3D tokens (groups); also FPS centres
     n  2D image patches                               k  neighbours, or keypoints where no cloud is near
     l  answer tokens                                  s  side of the square image the network sees, pixels
-    u  upcoming keyframes
+    u  upcoming keyframes                             m  moments that are looked back on
 
 Docstrings write them in capitals. A struct holds one item or a batch: `*b` stands for any number of leading axes, the
 same for all its fields. The structs are generic in the array type: `Example[np.ndarray]` on the host,
@@ -22,9 +22,11 @@ the world frame. Quaternions are xyzw, unit length, canonical (qw >= 0). `grippe
 
 import dataclasses
 from collections.abc import Iterable, Sequence
+from types import ModuleType
 from typing import Generic, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
@@ -34,6 +36,8 @@ ArrayT = TypeVar("ArrayT", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 """The type of a struct's arrays."""
 
 TABLE_HEIGHT = 0.752
+LOOK_BACK = 4
+"""M: the states that a `Past` holds."""
 
 T = TypeVar("T")
 
@@ -111,12 +115,25 @@ class RobotState(Generic[ArrayT]):
 
 
 @pytree
+class Past(Generic[ArrayT]):
+    """What an episode has been before the present observation."""
+
+    robot: RobotState[ArrayT]
+    """The states (*b, m, a, 7) before each of the last keyframes, the oldest first; an episode's first state stands for
+    those before it."""
+    keyframes: Int[ArrayT, "*b"]
+    """int32: how many were executed."""
+
+
+@pytree
 class Observation(Generic[ArrayT]):
-    """What a policy may look at: pictures and the robot's state."""
+    """What a policy may look at: pictures, the robot's state, and what has been."""
 
     pictures: Picture[ArrayT]
     """One of each camera: rgb (*b, c, h, w, 3), and so on. All have one size."""
     robot: RobotState[ArrayT]
+    past: Past[ArrayT] | None = None
+    """None where nobody kept it: as at the beginning of an episode."""
 
 
 @pytree
@@ -178,6 +195,8 @@ class PoseInputs(Generic[ArrayT]):
     keypoints: Float[ArrayT, "*b 2 3"]
     """The active one of each arm, metres, world frame; zeros where none is known."""
     has_keypoints: Bool[ArrayT, "*b"]
+    past: Past[ArrayT]
+    """Of two arms, as `robot`."""
 
 
 @pytree
@@ -207,3 +226,8 @@ class ModelInputs(Generic[ArrayT]):
 
 NumpyOrJax = TypeVar("NumpyOrJax", np.ndarray, jax.Array)
 """The arrays of one library: what a function of both is given and returns."""
+
+
+def library_of(array: object) -> ModuleType:
+    """numpy for its own arrays, jax.numpy for all else."""
+    return np if isinstance(array, np.ndarray) else jnp

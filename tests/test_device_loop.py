@@ -22,7 +22,11 @@ def random_policy(baseline: Baseline, plain: Policy) -> Policy:
     """A policy that answers with poses, with random weights, as large as another one."""
     config = dataclasses.replace(plain.config, baseline=baseline)
     learner = make_learner(baseline, config.encoding, config.model, plain.tokenizer)
-    variables = jax.tree.map(lambda x: x + 0.05, learner.initialise(jax.random.key(0)))
+    leaves, structure = jax.tree.flatten(learner.initialise(jax.random.key(0)))
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    # What begins at zero, such as the last layer, answers too.
+    leaves = [x + 0.05 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    variables = jax.tree.unflatten(structure, leaves)
     return make_policy(config, variables, plain.tokenizer)
 
 

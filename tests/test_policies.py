@@ -46,6 +46,9 @@ BASELINES = {
     "dp3": DP3Config(
         upcoming=2, point_channels=(16, 32), feature=32, language_layers=1, channels=(16, 32), inference_steps=5
     ),
+    "dp3_that_looks_back": DP3Config(
+        look_back=2, point_channels=(16,), feature=16, language_layers=0, channels=(16,), inference_steps=2
+    ),
 }
 
 

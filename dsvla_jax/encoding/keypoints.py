@@ -4,14 +4,12 @@ An arm has K keypoints in the order the instruction names them. The active one i
 5 cm of; it never goes back, and the last one stays active for good. Arms with fewer than K keypoints repeat their last.
 """
 
-from types import ModuleType
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from dsvla_jax.types import Array
+from dsvla_jax.types import Array, library_of
 
 REACHED_RADIUS = 0.05
 
@@ -27,7 +25,7 @@ def active_keypoint(latched_count: ArrayLike, keypoints: ArrayLike, count: Array
     Returns:
         float (3,). A NumPy array if ``keypoints`` is one.
     """
-    xp = _library(keypoints)
+    xp = library_of(keypoints)
     points = xp.asarray(keypoints)
     last = (points.shape[0] if count is None else xp.asarray(count)) - 1
     return points[xp.clip(xp.asarray(latched_count), 0, last)]
@@ -48,7 +46,7 @@ def advance_latch(
     Returns:
         int32 (A,), at least ``latched``. A NumPy array if ``keypoints`` is one.
     """
-    xp = _library(keypoints)
+    xp = library_of(keypoints)
     points = xp.asarray(keypoints)
     distance = xp.linalg.norm(points - xp.asarray(end_effector)[:, None, :], axis=-1)
     reached = (distance < radius) | (xp.arange(points.shape[1]) < xp.asarray(latched)[:, None])
@@ -64,7 +62,3 @@ def replay_latch(end_effector: ArrayLike, keypoints: ArrayLike) -> Array:
         return latched, jax.vmap(active_keypoint)(latched, keypoints)
 
     return jax.lax.scan(look, jnp.zeros(keypoints.shape[0], jnp.int32), jnp.asarray(end_effector))[1]
-
-
-def _library(array: ArrayLike) -> ModuleType:
-    return np if isinstance(array, np.ndarray) else jnp

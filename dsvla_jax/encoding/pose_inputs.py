@@ -1,52 +1,65 @@
 """The one path from what a robot sees and is told to the inputs of policies that answer with poses."""
 
-from types import ModuleType
-from typing import TypeVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from dsvla_jax.encoding.past import first_past
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.errors import UserError
-from dsvla_jax.types import Array, Camera, Picture, PoseExample, PoseInputs, RobotState, Text
-
-AnyArray = TypeVar("AnyArray", np.ndarray, jax.Array)
+from dsvla_jax.types import (
+    LOOK_BACK,
+    Camera,
+    NumpyOrJax,
+    Past,
+    Picture,
+    PoseExample,
+    PoseInputs,
+    RobotState,
+    Text,
+    library_of,
+)
 
 ARMS = 2
 
 
-def with_two_arms(array: AnyArray, axis: int) -> AnyArray:
+def with_two_arms(array: NumpyOrJax, axis: int) -> NumpyOrJax:
     """The array with zeros for the second arm of a robot that has one, along the axis of arms."""
     missing = ARMS - array.shape[axis]
     if not missing:
         return array
     widths = [(0, missing if place == axis else 0) for place in range(array.ndim)]
-    return _library(array).pad(array, widths)
+    return library_of(array).pad(array, widths)
 
 
 def pose_inputs(
-    pictures: Picture[AnyArray],
-    robot: RobotState[AnyArray],
-    words: Text[AnyArray],
-    keypoints: Float[AnyArray, "*b a 3"] | None,
-) -> PoseInputs[AnyArray]:
+    pictures: Picture[NumpyOrJax],
+    robot: RobotState[NumpyOrJax],
+    words: Text[NumpyOrJax],
+    keypoints: Float[NumpyOrJax, "*b a 3"] | None,
+    past: Past[NumpyOrJax] | None,
+) -> PoseInputs[NumpyOrJax]:
     """Puts the inputs of one robot, or of a batch of robots with equally many arms, together.
 
-    keypoints: the active one of each arm, metres, world frame, or None.
+    keypoints: the active one of each arm, metres, world frame, or None. past: None at the beginning of an episode.
     """
-    library = _library(robot.pose)
+    library = library_of(robot.pose)
     *batch, arms, _ = robot.pose.shape
     axis = len(batch)
     state = RobotState(with_two_arms(robot.pose, axis), with_two_arms(robot.gripper_open, axis))
-    there: AnyArray = library.broadcast_to(library.arange(ARMS) < arms, (*batch, ARMS))
-    near: AnyArray = library.zeros((*batch, ARMS, 3), np.float32)
+    there: NumpyOrJax = library.broadcast_to(library.arange(ARMS) < arms, (*batch, ARMS))
+    near: NumpyOrJax = library.zeros((*batch, ARMS, 3), np.float32)
     if keypoints is not None:
         near = with_two_arms(keypoints, axis)
-    has_keypoints: AnyArray = library.full(tuple(batch), keypoints is not None)
-    return PoseInputs(pictures, state, there, words, near, has_keypoints)
+    has_keypoints: NumpyOrJax = library.full(tuple(batch), keypoints is not None)
+    past = first_past(robot) if past is None else past
+    before = RobotState(
+        with_two_arms(past.robot.pose, axis + 1),
+        with_two_arms(past.robot.gripper_open, axis + 1),
+    )
+    return PoseInputs(pictures, state, there, words, near, has_keypoints, Past(before, past.keyframes))
 
 
 def encode_instruction(tokenizer: Tokenizer, instruction: str, length: int) -> Text[np.ndarray]:
@@ -81,9 +94,6 @@ def pose_example_spec(
         Text(spec(jnp.int32, words), spec(jnp.bool_, words)),
         spec(jnp.float32, ARMS, 3),
         spec(jnp.bool_),
+        Past(RobotState(spec(jnp.float32, LOOK_BACK, ARMS, 7), spec(jnp.float32, LOOK_BACK, ARMS)), spec(jnp.int32)),
     )
     return PoseExample(inputs, spec(jnp.float32, upcoming, ARMS, 7), spec(jnp.float32, upcoming, ARMS))
-
-
-def _library(array: np.ndarray | Array) -> ModuleType:
-    return np if isinstance(array, np.ndarray) else jnp

@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float, Int
 
+from dsvla_jax.encoding.past import first_past
 from dsvla_jax.evaluation.loop import KeypointSource, policy_step
 from dsvla_jax.evaluation.outcome import EpisodeOutcome, failure_reasons, is_over, views_of
 from dsvla_jax.model.variables import Variables
@@ -20,7 +21,7 @@ from dsvla_jax.policies.interface import DevicePolicy, Policy
 from dsvla_jax.sim import environment as simulator
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import Physics, SimState, jit_with_mjx
-from dsvla_jax.types import Action, Array, Observation
+from dsvla_jax.types import Action, Array, Observation, Past
 
 
 @struct.dataclass
@@ -41,6 +42,7 @@ class _Carry(NamedTuple):
     done: Array
     state: SimState
     latched: Array
+    past: Past[Array]
     answers: object
     targets: Array
     keyframes: Array
@@ -70,9 +72,10 @@ def device_loop(environment: Environment, policy: DevicePolicy, limit: int) -> L
 
         def turn(carry: _Carry) -> _Carry:
             running = ~is_over(carry.state)
-            state, latched, action, answer = policy_step(
+            state, latched, past, action, answer = policy_step(
                 carry.state,
                 environment.observe(carry.state),
+                carry.past,
                 carry.latched,
                 keypoints,
                 decide,
@@ -80,7 +83,7 @@ def device_loop(environment: Environment, policy: DevicePolicy, limit: int) -> L
             )
             answers = jax.tree.map(lambda kept, new: kept.at[carry.done].set(new), carry.answers, answer)
             targets = carry.targets.at[carry.done].set(action.pose[..., :3])
-            return _Carry(carry.done + 1, state, latched, answers, targets, carry.keyframes + running)
+            return _Carry(carry.done + 1, state, latched, past, answers, targets, carry.keyframes + running)
 
         state, latched = jax.tree.map(jnp.asarray, state), jnp.zeros((batch, arms), jnp.int32)
         answer = jax.eval_shape(lambda: decide(environment.observe(state), keypoints[:, :, 0])[1])
@@ -91,6 +94,7 @@ def device_loop(environment: Environment, policy: DevicePolicy, limit: int) -> L
                 done=jnp.int32(0),
                 state=state,
                 latched=latched,
+                past=first_past(environment.observe(state).robot),
                 answers=jax.tree.map(lambda leaf: jnp.zeros((limit, *leaf.shape), leaf.dtype), answer),
                 targets=jnp.zeros((limit, batch, arms, 3)),
                 keyframes=jnp.zeros(batch, jnp.int32),

@@ -4,6 +4,7 @@ A policy is any function (Observation, B instructions, active keypoints (B, A, 3
 """
 
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
@@ -15,12 +16,13 @@ from tqdm import tqdm
 
 from dsvla_jax.compile_times import first_use
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.encoding.past import first_past, remember
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.outcome import EpisodeOutcome, View, failure_reasons, is_over, views_of
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
-from dsvla_jax.types import Action, Array, Observation
+from dsvla_jax.types import Action, Array, Observation, Past
 
 Act = Callable[[Observation, Sequence[str], np.ndarray], tuple[Action, Sequence[str]]]
 # State and what is seen of it -> keypoints (B, A, K, 3), and why an episode has none, empty where it has.
@@ -33,6 +35,7 @@ class Turn(NamedTuple, Generic[Answer]):
 
     state: SimState
     latched: Array
+    past: Past
     action: Action
     answer: Answer
 
@@ -40,6 +43,7 @@ class Turn(NamedTuple, Generic[Answer]):
 def policy_step(
     state: SimState,
     observation: Observation,
+    past: Past,
     latched: Int[Array | np.ndarray, "b a"],
     keypoints: Float[Array | np.ndarray, "b a k 3"],
     decide: Callable[[Observation, Array], tuple[Action, Answer]],
@@ -47,13 +51,14 @@ def policy_step(
 ) -> Turn[Answer]:
     """One step of the closed loop: advances the keypoint latches, asks the policy, moves to the keyframe.
 
-    decide: (observation, active keypoints (B, A, 3)) -> (action, answer). step: of the environment. The host's loop and
-    the device's are both made of it; it can be traced if both functions can.
+    past: of the episodes, before this observation. decide: (observation, active keypoints (B, A, 3)) -> (action,
+    answer). step: of the environment. The host's loop and the device's are both made of it; it can be traced if both
+    functions can.
     """
     latched = jax.vmap(advance_latch)(latched, observation.robot.pose[..., :3], keypoints)
     active = jax.vmap(jax.vmap(active_keypoint))(latched, keypoints)
-    action, answer = decide(observation, active)
-    return Turn(step(state, action), latched, action, answer)
+    action, answer = decide(dataclasses.replace(observation, past=past), active)
+    return Turn(step(state, action), latched, remember(past, observation.robot), action, answer)
 
 
 class Stopped(Exception):
@@ -163,6 +168,7 @@ def run_episodes(
     answers: list[list[str]] = [[] for _ in range(batch)]
     targets: list[list[np.ndarray]] = [[] for _ in range(batch)]
     over = np.array(is_over(state))
+    past: Past | None = None
 
     def decide(observation: Observation, active: Array) -> tuple[Action, Sequence[str]]:
         return act(observation, instructions, np.asarray(active))
@@ -175,7 +181,9 @@ def run_episodes(
         keypoints = (keypoints + noise[:, :, : keypoints.shape[2]]).astype(np.float32)
         problems = [old or new for old, new in zip(problems, missing, strict=True)]
         over |= np.array([bool(problem) for problem in problems])
-        state, latched, action, texts = policy_step(state, observation, latched, keypoints, decide, environment.step)
+        past = first_past(observation.robot) if past is None else past
+        turn = policy_step(state, observation, past, latched, keypoints, decide, environment.step)
+        state, latched, past, action, texts = turn
         views, positions = views_of(observation), np.asarray(action.pose)[..., :3]
         for i in np.flatnonzero(~over).tolist():
             seen[i].append(views[i])

@@ -5,13 +5,11 @@ Those generic in `NumpyOrJax` compute NumPy's arrays with NumPy, in their own pr
 Formulas: https://en.wikipedia.org/wiki/Quaternions_and_spatial_rotation.
 """
 
-from types import ModuleType
-
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from dsvla_jax.types import Array, NumpyOrJax
+from dsvla_jax.types import Array, NumpyOrJax, library_of
 
 # A half turn about x less a half turn about z: the gripper's approach axis (its own +z) points along world -z.
 DOWN = np.array([0.0, 1.0, 0.0, 0.0], np.float32)
@@ -30,7 +28,7 @@ def quaternion_multiply(left: ArrayLike, right: ArrayLike) -> Array:
 
 def hamilton_product(left: NumpyOrJax, right: NumpyOrJax) -> NumpyOrJax:
     """`quaternion_multiply` of two arrays of one library."""
-    library = _library(left)
+    library = library_of(left)
     x1, y1, z1, w1 = library.moveaxis(left, -1, 0)
     x2, y2, z2, w2 = library.moveaxis(right, -1, 0)
     return library.stack(
@@ -70,7 +68,7 @@ def quaternion_from_axis_angle(axis: ArrayLike, angle: ArrayLike) -> Array:
 
 def rotation_vector_to_quaternion(vector: NumpyOrJax) -> NumpyOrJax:
     """Rotation vectors (..., 3) -> unit quaternions (..., 4)."""
-    library = _library(vector)
+    library = library_of(vector)
     angle = library.linalg.norm(vector, axis=-1, keepdims=True)
     # sin(a / 2) / a, which is 1 / 2 at 0.
     imaginary = vector * library.sinc(angle / (2 * np.pi)) / 2
@@ -79,7 +77,7 @@ def rotation_vector_to_quaternion(vector: NumpyOrJax) -> NumpyOrJax:
 
 def quaternion_to_rotation_vector(quaternion: NumpyOrJax) -> NumpyOrJax:
     """Unit quaternions (..., 4) -> rotation vectors (..., 3) of at most half a turn."""
-    library = _library(quaternion)
+    library = library_of(quaternion)
     real = quaternion[..., 3:]
     imaginary = quaternion[..., :3] * library.where(real < 0, -1.0, 1.0)
     sine = library.linalg.norm(imaginary, axis=-1, keepdims=True)
@@ -89,7 +87,7 @@ def quaternion_to_rotation_vector(quaternion: NumpyOrJax) -> NumpyOrJax:
 
 def quaternion_to_matrix(quaternion: NumpyOrJax) -> NumpyOrJax:
     """Unit quaternions (..., 4) -> rotation matrices (..., 3, 3)."""
-    library = _library(quaternion)
+    library = library_of(quaternion)
     x, y, z, w = library.moveaxis(quaternion, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -198,7 +196,3 @@ def rotation_distance(first: ArrayLike, second: ArrayLike) -> Array:
     """The angle in radians, 0 to pi, of the turn that takes one rotation to the other. (..., 4) x 2 -> (...,)."""
     difference = quaternion_multiply(quaternion_conjugate(first), second)
     return 2.0 * jnp.arctan2(jnp.linalg.norm(difference[..., :3], axis=-1), jnp.abs(difference[..., 3]))
-
-
-def _library(array: np.ndarray | Array) -> ModuleType:
-    return np if isinstance(array, np.ndarray) else jnp

@@ -25,7 +25,7 @@ from dsvla_jax.model.vla import VLA, blank_inputs
 from dsvla_jax.policies.config import BehaviourCloningConfig
 from dsvla_jax.policies.pose_network import Vectors, mean_over_arm, weighted
 from dsvla_jax.policies.pose_vectors import VECTOR
-from dsvla_jax.policies.robot_vector import robot_vector, with_waves
+from dsvla_jax.policies.robot_vector import robot_vector, robot_width, with_waves
 from dsvla_jax.types import Array, ModelInputs, PoseInputs
 
 
@@ -89,7 +89,7 @@ class BehaviourCloning:
     def initialise(self, key: Array) -> Variables:
         """See `PoseNetwork`."""
         blank = blank_inputs(self.model)
-        robot = jnp.zeros((1, ARMS * (VECTOR + 5)))
+        robot = jnp.zeros((1, robot_width()))
         variables = dict(jax.jit(lambda key: self._network.init(key, blank, robot, method=PoseVLA.poses))(key))
         if self.model.base_dtype == "int8":
             variables["params"] = quantize(variables["params"])

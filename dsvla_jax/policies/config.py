@@ -9,6 +9,7 @@ from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.ranges import at_least, check_fields, require
+from dsvla_jax.types import LOOK_BACK
 
 # Heads of the attention to words, and groups of channels that are normalised together.
 DP3_HEADS, DP3_GROUPS = 4, 8
@@ -48,6 +49,8 @@ class DP3Config:
     """Which policy this is."""
     upcoming: int = 4
     """Keyframes that are denoised together; the first is executed."""
+    look_back: int = 0
+    """Earlier states of the robot that it reads, at most 4, with the number of keyframes so far; 0 for neither."""
     colours: bool = True
     """Whether points have colours; the original's have none."""
     point_channels: tuple[int, ...] = (64, 128, 256)
@@ -68,6 +71,7 @@ class DP3Config:
             self,
             "baseline",
             upcoming=at_least(1),
+            look_back=at_least(0, at_most=LOOK_BACK),
             feature=at_least(1),
             point_channels=at_least(1),
             channels=at_least(1),

@@ -31,19 +31,26 @@ def add_noise(clean: Array, noise: Array, level: Int[Array, " b"], shares: np.nd
     return jnp.sqrt(share) * clean + jnp.sqrt(1 - share) * noise
 
 
-def denoise(predict: Callable[[Array, Int[Array, " b"]], Array], noise: Array, shares: np.ndarray, steps: int) -> Array:
+def denoise(
+    predict: Callable[[Array, Int[Array, " b"]], Array],
+    noise: Array,
+    shares: np.ndarray,
+    steps: int,
+    largest: float | np.ndarray = 1.0,
+) -> Array:
     """Samples clean vectors from noise in so many steps.
 
-    predict: (noisy vectors, noise level of each example) -> clean vectors, which are taken to lie in -1 to 1.
+    predict: (noisy vectors, noise level of each example) -> clean vectors.
     noise: float32 (B, ...).
     steps: at most as many as there are noise levels.
+    largest: no number of a clean vector is further from 0; of all, or of each along the last axis.
     """
     levels = np.linspace(len(shares) - 1, 0, steps).round().astype(np.int32)
     before = np.concatenate([shares[levels], [1.0]]).astype(np.float32)
 
     def step(noisy: Array, one: tuple[Array, Array, Array]) -> tuple[Array, None]:
         level, share, next_share = one
-        clean = jnp.clip(predict(noisy, jnp.full(len(noisy), level)), -1, 1)
+        clean = jnp.clip(predict(noisy, jnp.full(len(noisy), level)), -largest, largest)
         left = (noisy - jnp.sqrt(share) * clean) / jnp.sqrt(1 - share)
         return jnp.sqrt(next_share) * clean + jnp.sqrt(1 - next_share) * left, None
 

@@ -24,8 +24,8 @@ from dsvla_jax.model.variables import Variables
 from dsvla_jax.policies.config import DP3_GROUPS, DP3_HEADS, DP3Config
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
 from dsvla_jax.policies.pose_network import Vectors, mean_over_arm
-from dsvla_jax.policies.pose_vectors import VECTOR, center, scale_position
-from dsvla_jax.policies.robot_vector import robot_vector, with_waves
+from dsvla_jax.policies.pose_vectors import LARGEST, VECTOR, center, scale_position
+from dsvla_jax.policies.robot_vector import robot_vector, robot_width, with_waves
 from dsvla_jax.types import Array, PoseInputs, Text
 
 KERNEL = 5
@@ -41,6 +41,7 @@ class PointEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, points: Array) -> Array:
+        """points: places scaled to the box, with colours or without."""
         x = points
         for number, width in enumerate(self.channels):
             x = nn.relu(nn.LayerNorm(name=f"norm_{number}")(nn.Dense(width, name=f"layer_{number}")(x)))
@@ -55,6 +56,7 @@ class Condition(nn.Module):
 
     @nn.compact
     def __call__(self, points: Array, words: Text[Array], robot: Array) -> Array:
+        """points (B, P, 3 or 6), and robot (B, R) as `robot_vector` gives it."""
         width = self.config.feature
         seen = PointEncoder(self.config.point_channels, width, name="points")(points)
         embedded = nn.Embed(self.vocabulary, width, name="words")(words.tokens)
@@ -81,6 +83,7 @@ class Convolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
+        """x: float32."""
         length, channels = x.shape[1:]
         weights = self.param("kernel", nn.initializers.lecun_normal(), (self.kernel, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
@@ -99,6 +102,8 @@ class ResidualBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, condition: Array) -> Array:
+        """condition (B, D) -> (B, U, `channels`)."""
+
         def convolve(x: Array, name: str) -> Array:
             x = Convolution(self.channels, KERNEL, name=name)(x)
             return jax.nn.mish(nn.GroupNorm(DP3_GROUPS, name=f"{name}_norm")(x))
@@ -116,6 +121,7 @@ class UNet(nn.Module):
 
     @nn.compact
     def __call__(self, noisy: Array, level: Array, condition: Array) -> Array:
+        """level: int32 (B,). condition: (B, D)."""
         half = LEVEL_WIDTH // 2
         angles = level[:, None] * jnp.asarray(LONGEST ** (-np.arange(half) / (half - 1)))
         waves = jnp.concatenate([jnp.sin(angles), jnp.cos(angles)], axis=-1)
@@ -149,10 +155,12 @@ class Denoiser(nn.Module):
     vocabulary: int
 
     def setup(self) -> None:
+        """Makes both parts."""
         self.condition = Condition(self.config, self.vocabulary)
         self.unet = UNet(self.config.channels)
 
     def __call__(self, noisy: Array, level: Array, points: Array, words: Text[Array], robot: Array) -> Array:
+        """Clean vectors (B, U, D) from noisy ones; see the parts."""
         return self.unet(noisy, level, self.condition(points, words, robot))
 
 
@@ -182,7 +190,7 @@ class DP3:
         """See `PoseNetwork`."""
         words = Text(jnp.zeros((1, 2), jnp.int32), jnp.ones((1, 2), bool))
         points = jnp.zeros((1, self.encoding.points.num_points, 6 if self.config.colours else 3))
-        noisy, robot = jnp.zeros((1, self.upcoming, ARMS * VECTOR)), jnp.zeros((1, ARMS * (VECTOR + 5)))
+        noisy, robot = jnp.zeros((1, self.upcoming, ARMS * VECTOR)), jnp.zeros((1, robot_width(self.config.look_back)))
         init = jax.jit(lambda key: self._network.init(key, noisy, jnp.zeros(1, jnp.int32), points, words, robot))
         return dict(init(key))
 
@@ -192,7 +200,7 @@ class DP3:
         points = scale_position(points, center(codec), codec)
         if self.config.colours:
             points = jnp.concatenate([points, colours], axis=-1)
-        robot = robot_vector(inputs, codec)
+        robot = robot_vector(inputs, codec, self.config.look_back)
         run = lambda network: network.condition(points, inputs.words, robot)  # noqa: E731
         return cast(Array, self._network.apply(variables, method=run))
 
@@ -224,5 +232,6 @@ class DP3:
             noise,
             self._shares,
             self.config.inference_steps,
+            np.tile(LARGEST, ARMS),
         )
         return clean.reshape(*shape[:2], ARMS, VECTOR)

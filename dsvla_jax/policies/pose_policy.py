@@ -172,7 +172,7 @@ class PosePolicy:
         near = None
         if keypoints is not None and self.config.wants_keypoints:
             near = np.asarray(keypoints, np.float32)
-        inputs = pose_inputs(observation.pictures, robot, words, near)
+        inputs = pose_inputs(observation.pictures, robot, words, near, observation.past)
         key = jax.random.key(ANSWER_SEED) if key is None else key
         action = _act(self.network, self.codec, self.variables, filled_up(inputs, size), key)
         action = Action(action.pose[:size, :arms], action.gripper_open[:size, :arms])
@@ -209,7 +209,7 @@ class PoseOnDevice:
     ) -> tuple[Action[Array], Action[Array]]:
         """See `DevicePolicy`."""
         near = keypoints if self.policy.config.wants_keypoints else None
-        inputs = pose_inputs(observation.pictures, observation.robot, question, near)
+        inputs = pose_inputs(observation.pictures, observation.robot, question, near, observation.past)
         vectors = self.policy.network.answer(variables, inputs, jax.random.key(ANSWER_SEED))
         action = first_keyframe(vectors, inputs, self.policy.codec)
         action = Action(action.pose[:, : self.arms], action.gripper_open[:, : self.arms])

@@ -7,6 +7,7 @@ answer is where the arm is, so that an answer stays the same when the world is s
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from dsvla_jax.encoding.codec import PoseCodec
@@ -15,6 +16,8 @@ from dsvla_jax.types import Action, Array
 
 VECTOR = 10
 POSITION, ROTATION, GRIPPER = slice(0, 3), slice(3, 9), 9
+# Two places in a box are at most two half sides from each other.
+LARGEST = np.array([2.0] * 3 + [1.0] * 7, np.float32)
 
 
 def center(codec: PoseCodec) -> Float[Array, "3"]:

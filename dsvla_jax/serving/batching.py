@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
+from dsvla_jax.encoding.past import first_past
 from dsvla_jax.geometry.cameras import front_camera
 from dsvla_jax.policies.interface import BATCH_SIZES, Policy
 from dsvla_jax.types import TABLE_HEIGHT, Observation, Picture, RobotState, join_cameras
@@ -84,7 +85,8 @@ def blank_question(arms: int, cameras: int, height: int, width: int) -> Question
     pose = np.tile(np.array([0.3, 0.0, TABLE_HEIGHT + 0.5, 0.0, 1.0, 0.0, 0.0], np.float32), (arms, 1))
     picture = Picture(np.zeros((height, width, 3), np.uint8), np.ones((height, width), np.float32), camera)
     robot = RobotState(pose, np.ones(arms, np.float32))
-    return Question("", Observation(join_cameras([picture] * cameras), robot), pose[:, :3])
+    observation = Observation(join_cameras([picture] * cameras), robot, first_past(robot))
+    return Question("", observation, pose[:, :3])
 
 
 class MicroBatcher:

@@ -294,15 +294,18 @@ class PolicyServer:
     async def _question(self, request: Request, session: Session) -> tuple[Question, Progress | None]:
         """The request as the policy is asked it. What the policy would refuse is refused here, for one robot alone."""
         keypoints = progress = None
+        begins = False
         self._check_prompt(request, None)  # before anything is looked for in the picture
         if self._policy.config.wants_keypoints:
             known = await self._all_keypoints(request, session)
-            if session.begins(request, known):
+            begins = session.begins(request, known)
+            if begins:
                 await asyncio.to_thread(check_first_keypoints, request, known)
             keypoints, progress = session.advance(request, known)
             self._check_prompt(request, keypoints)
             session.keep(progress)
-        return Question(request.instruction, request.observation, keypoints), progress
+        observation = dataclasses.replace(request.observation, past=session.look_back(request, begins))
+        return Question(request.instruction, observation, keypoints), progress
 
     def _check_prompt(self, request: Request, keypoints: np.ndarray | None) -> None:
         """Raises BadRequest if the policy does not know a word, or the prompt is longer than what is compiled."""

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from dsvla_jax.encoding.keypoints import active_keypoint, advance_latch
+from dsvla_jax.encoding.past import first_past, remember
 from dsvla_jax.perception.keypoints import KeypointTracker
 from dsvla_jax.serving.requests import Request
-from dsvla_jax.types import split_cameras
+from dsvla_jax.types import Past, RobotState, split_cameras
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Session:
     def __init__(self, tracker: KeypointTracker | None = None) -> None:
         self._tracker = tracker
         self._progress: Progress | None = None
+        self._past: tuple[str, RobotState[np.ndarray], Past[np.ndarray]] | None = None
 
     def look(self, request: Request, arms: Sequence[Sequence[str]]) -> np.ndarray:
         """The keypoints (A, K, 3) of the phrases for each arm, seen in this picture or before in the episode.
@@ -60,6 +62,18 @@ class Session:
         reached = np.asarray(advance_latch(before, positions, keypoints))
         active = [active_keypoint(count, row) for count, row in zip(reached, keypoints, strict=True)]
         return np.stack([np.asarray(point) for point in active]), Progress(request.instruction, shape, reached)
+
+    def look_back(self, request: Request, begins: bool) -> Past[np.ndarray]:
+        """What the episode has been before this request, which becomes part of it.
+
+        begins: whether an episode begins with the request's keypoints; one begins with another instruction, or another
+        number of arms, in any case.
+        """
+        robot, known = request.observation.robot, self._past
+        same = known is not None and (known[0], known[1].pose.shape) == (request.instruction, robot.pose.shape)
+        past = remember(known[2], known[1]) if known and same and not (begins or request.reset) else first_past(robot)
+        self._past = request.instruction, robot, past
+        return past
 
     def keep(self, progress: Progress) -> None:
         """Takes over the progress of a request that is answered."""

@@ -5,30 +5,40 @@ import math
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 from tqdm import tqdm
 
 from dsvla_jax.checkpoints.run import Arrays, Notes, Restored, RunCheckpoints
 from dsvla_jax.experiment import Schedule
+from dsvla_jax.json_values import Json
 from dsvla_jax.model.variables import Regime, Variables
-from dsvla_jax.policies.interface import Learner
+from dsvla_jax.policies.interface import Metrics
+from dsvla_jax.policies.registry import ConfiguredLearner
 from dsvla_jax.training.chips import peak_flops
 from dsvla_jax.training.health import Clock, SkippedSteps, memory
 from dsvla_jax.training.metrics import MetricsWriter
 from dsvla_jax.training.signals import StopRequest
 from dsvla_jax.training.state import TrainState
 
-Step = Callable[[TrainState, Any], tuple[TrainState, dict[str, Any]]]
+Step = Callable[[TrainState, object], tuple[TrainState, Metrics]]
 
 
 class Batches(Protocol):
     """An endless stream of batches whose position can be saved as JSON."""
 
-    def __next__(self) -> Any: ...
-    def get_state(self) -> dict[str, Any]: ...
-    def set_state(self, state: dict[str, Any]) -> None: ...
+    def __next__(self) -> object:
+        """The next batch, of what the run's learner learns from."""
+        ...
+
+    def get_state(self) -> dict[str, Json]:
+        """The position, before the next batch."""
+        ...
+
+    def set_state(self, state: dict[str, Json]) -> None:
+        """Goes to a position."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +72,7 @@ def train(
     batches: Batches,
     checkpoints: RunCheckpoints,
     metrics: MetricsWriter,
-    learner: Learner[Any, Any],
+    learner: ConfiguredLearner,
     checks: Sequence[PeriodicEval] = (),
     note: Callable[[str], None] = lambda doing: None,
 ) -> signal.Signals | None:

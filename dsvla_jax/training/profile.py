@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 from tqdm import tqdm
 
+from dsvla_jax.policies.interface import Metrics
 from dsvla_jax.training.loop import Step
 from dsvla_jax.training.state import TrainState
 
@@ -29,7 +30,7 @@ def trace_steps(step: Step, folder: Path, count: int) -> Iterator[Step]:
                 "at https://ui.perfetto.dev)"
             )
 
-    def traced(state: TrainState, batch: object) -> tuple[TrainState, dict[str, object]]:
+    def traced(state: TrainState, batch: object) -> tuple[TrainState, Metrics]:
         nonlocal calls, tracing
         calls += 1
         if count and calls == FIRST:
