@@ -37,7 +37,7 @@ from dsvla_jax.experiment import Experiment
 from dsvla_jax.planner.preflight import check_step
 from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
-from tests.odd_settings import OddSetting, odd_settings, toy_experiment
+from tests.odd_settings import OddSetting, baseline_experiments, odd_settings, toy_experiment
 
 DATASET = "utokyo_xarm_bimanual_converted_externally_to_rlds"
 # Nothing of the toy size needs more; a value that does must be refused before it is allocated.
@@ -175,16 +175,22 @@ def outcomes_of(experiment: Experiment, odds: list[OddSetting], folder: Path) ->
 def main(options: Options, folder: Path) -> int:
     """Prints the figures, and each value that is neither refused nor trained. Returns the exit status."""
     toy, outcomes = toy_experiment(folder), {}
-    for experiment in (toy, oxe_experiment(toy, folder)):
-        # Of the second experiment only what the first does not have.
-        odds = [odd for odd in odd_settings(experiment) if odd.name.startswith("oxe.") == (experiment.oxe is not None)]
-        outcomes |= outcomes_of(experiment, [odd for odd in odds if odd.name.startswith(options.only)], folder)
-    for odd, outcome in outcomes.items():
+    experiments = [(toy, ""), (oxe_experiment(toy, folder), "oxe.")]
+    experiments += [(experiment, "baseline.") for experiment in baseline_experiments(toy)]
+    for experiment, section in experiments:
+        # Of all but the first experiment only what that does not have.
+        odds = [odd for odd in odd_settings(experiment) if odd.name.startswith(section)]
+        chosen = [odd for odd in odds if odd.name.startswith(options.only)]
+        told = outcomes_of(experiment, chosen, folder)
+        kind = experiment.baseline and f"{experiment.baseline.kind}: "
+        outcomes |= {(kind or "", odd): outcome for odd, outcome in told.items()}
+    for (kind, odd), outcome in outcomes.items():
         if outcome not in (REFUSED, TRAINED):
-            print(f"{odd.name} = {odd.value!r}: {outcome}")
+            print(f"{kind}{odd.name} = {odd.value!r}: {outcome}")
     counts = collections.Counter(one if one in (REFUSED, TRAINED) else "neither" for one in outcomes.values())
     print(
-        f"{len({odd.name for odd in outcomes})} fields, {len(outcomes)} values: {counts[REFUSED]} {REFUSED}, "
+        f"{len({(kind, odd.name) for kind, odd in outcomes})} fields, {len(outcomes)} values: "
+        f"{counts[REFUSED]} {REFUSED}, "
         f"{counts[TRAINED]} {TRAINED}, {counts['neither']} neither (expected 0)"
     )
     return int(counts["neither"] > 0)

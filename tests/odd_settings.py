@@ -14,6 +14,7 @@ from dsvla_jax.encoding.pretrained_tokenizers import save_tokenizer
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
 from dsvla_jax.experiment import Experiment, ValidationConfig
 from dsvla_jax.model.config import LoraConfig, ModelConfig, RopeScaling, VisualPromptConfig
+from dsvla_jax.policies.config import BehaviourCloningConfig, DP3Config
 from tests.random_data import random_episode
 from tests.small import small_encoding, small_language, small_vision
 
@@ -57,6 +58,15 @@ def toy_experiment(folder: Path) -> Experiment:
         log_every=1,
         validate_every=2,
     )
+
+
+def baseline_experiments(toy: Experiment) -> list[Experiment]:
+    """The toy experiment with each of the baselines, at sizes that run two steps in seconds."""
+    small = DP3Config(point_channels=(16,), feature=16, language_layers=1, channels=(16, 32), inference_steps=2)
+    return [
+        dataclasses.replace(toy, baseline=BehaviourCloningConfig(hidden=16)),
+        dataclasses.replace(toy, baseline=small, model=ModelConfig()),
+    ]
 
 
 def odd_settings(experiment: Experiment) -> Iterator[OddSetting]:

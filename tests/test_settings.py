@@ -28,7 +28,7 @@ from dsvla_jax.suite_vocabulary import suite_tokenizer
 from dsvla_jax.training.distributed import Watchdog
 from dsvla_jax.training.run_folder import require_same_experiment, run_folder
 from dsvla_jax.training.sharding import make_mesh
-from tests.odd_settings import OddSetting, odd_settings, toy_experiment
+from tests.odd_settings import OddSetting, baseline_experiments, odd_settings, toy_experiment
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,9 @@ def test_every_field_of_every_config_takes_an_odd_value_or_says_why_not(toy: Exp
     """benchmarks/odd_settings.py trains two steps with each value that passes here."""
     asked, oxe = 0, dataclasses.replace(toy, oxe=OxeConfig(image_size=32), validate_every=0)
     assert len({odd.name for odd in odd_settings(oxe)}) > 115
-    for experiment in (toy, oxe):
-        for odd in odd_settings(experiment):
+    baselines = [(experiment, "baseline.") for experiment in baseline_experiments(toy)]
+    for experiment, section in [(toy, ""), (oxe, ""), *baselines]:
+        for odd in (odd for odd in odd_settings(experiment) if odd.name.startswith(section)):
             asked += 1
             # All else than a UserError would be a traceback.
             with contextlib.suppress(UserError):
