@@ -34,7 +34,7 @@ class BehaviourCloningConfig:
         check_fields(
             self,
             "baseline",
-            upcoming=at_least(1),
+            upcoming=at_least(1, at_most=100),
             hidden=at_least(1),
             rotation_weight=at_least(0),
             gripper_weight=at_least(0),
@@ -70,12 +70,12 @@ class DP3Config:
         check_fields(
             self,
             "baseline",
-            upcoming=at_least(1),
+            upcoming=at_least(1, at_most=100),
             look_back=at_least(0, at_most=LOOK_BACK),
             feature=at_least(1),
             point_channels=at_least(1),
             channels=at_least(1),
-            language_layers=at_least(0),
+            language_layers=at_least(0, at_most=100),
             diffusion_steps=at_least(2),
             inference_steps=at_least(1, at_most=self.diffusion_steps),
         )
