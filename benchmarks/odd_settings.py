@@ -48,6 +48,8 @@ LONG = 100
 # What the traced network does not depend on.
 NOT_TRACED = ("data.", "oxe.", "optimizer.", "validation.", "evaluation.")
 
+LARGE = 10**6
+
 REFUSED, TRAINED = "refused with a message", "trained two steps"
 Group = tuple[OddSetting, ...]
 
@@ -125,9 +127,13 @@ def start_worker() -> None:
 
 
 def groups_of(experiment: Experiment, odds: list[OddSetting], run: Path) -> list[Group]:
-    """The values in few groups: each field once in a group, and no two that contradict each other."""
+    """The values in few groups: each field once in a group, and no two that contradict each other.
+
+    Values that take much memory are alone: together they would be refused, and one after the other found again.
+    """
+    large = [odd for odd in odds if odd.value in (LARGE, (LARGE,))]
     groups: list[Group] = []
-    for odd in odds:
+    for odd in (odd for odd in odds if odd not in large):
         for place, group in enumerate(groups):
             alone = odd.name not in {other.name for other in group}
             if alone and not from_settings(experiment, (*group, odd), run, traced=False):
@@ -135,7 +141,7 @@ def groups_of(experiment: Experiment, odds: list[OddSetting], run: Path) -> list
                 break
         else:
             groups.append((odd,))
-    return groups
+    return groups + [(odd,) for odd in large]
 
 
 def train_group(experiment: Experiment, group: Group, folder: Path, bar: tqdm) -> dict[OddSetting, str]:
