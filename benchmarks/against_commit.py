@@ -2,8 +2,8 @@
 
 Usage: python -m benchmarks.against_commit COMMIT [--rounds 5]
 
-Both trees run the same commands by turns, in this Python, each with a cache of compiled programs that a first round
-fills. What counts is the median over rounds of the ratio of both. Uncommitted changes belong to this tree.
+The two trees alternate, with the same commands and this Python. Each has its own compilation cache, which a first round
+fills. The result is the median over rounds of the ratio of both. Uncommitted changes belong to this tree.
 """
 
 import dataclasses

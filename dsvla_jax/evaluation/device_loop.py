@@ -86,7 +86,8 @@ def device_loop(environment: Environment, policy: DevicePolicy, limit: int) -> L
             return _Carry(carry.done + 1, state, latched, past, answers, targets, carry.keyframes + running)
 
         state, latched = jax.tree.map(jnp.asarray, state), jnp.zeros((batch, arms), jnp.int32)
-        answer = jax.eval_shape(lambda: decide(environment.observe(state), keypoints[:, :, 0])[1])
+        start = environment.observe(state)
+        answer = jax.eval_shape(lambda: decide(start, keypoints[:, :, 0])[1])
         last = jax.lax.while_loop(
             goes_on,
             turn,
@@ -94,7 +95,7 @@ def device_loop(environment: Environment, policy: DevicePolicy, limit: int) -> L
                 done=jnp.int32(0),
                 state=state,
                 latched=latched,
-                past=first_past(environment.observe(state).robot),
+                past=first_past(start.robot),
                 answers=jax.tree.map(lambda leaf: jnp.zeros((limit, *leaf.shape), leaf.dtype), answer),
                 targets=jnp.zeros((limit, batch, arms, 3)),
                 keyframes=jnp.zeros(batch, jnp.int32),

@@ -5,6 +5,7 @@ import functools
 import math
 import re
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from dsvla_jax.policies.traced_flops import product_flops
 from dsvla_jax.training.chips import Chip, Slice
 from dsvla_jax.training.sharding import batch_part, batch_sharding, make_mesh
 from dsvla_jax.training.state import TrainState, initial_state, jit_train_step, make_optimizer, make_train_step
-from dsvla_jax.types import Array, Example, Picture, PoseExample, PoseInputs, Text
+from dsvla_jax.types import Array, Example, Picture, PoseExample, Text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,56 +109,54 @@ def plan_training(experiment: Experiment, where: Slice, examples: int) -> Plan:
 
 
 def plan_decoding(experiment: Experiment, where: Slice, examples: int) -> Plan:
-    """Observations to actions of one arm (of two, where a policy answers with poses), with so many examples a chip."""
+    """Plans one action for each of `examples` observations a chip.
+
+    3DS-VLA answers for one arm; a policy that answers with poses, for two.
+    """
     mesh = make_mesh(experiment.mesh, where.devices)
     experiment = dataclasses.replace(experiment, batch_size=examples * len(where.devices))
     batch_part(mesh, experiment.batch_size)
     state, frozen, _ = abstract_state(experiment, mesh)
-    if experiment.baseline is not None:
-        return _plan_poses(experiment, where, mesh, examples, state.trainable, frozen)
-    grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
-    batch = abstract_batch(experiment, mesh)
-    assert isinstance(batch, Example)
-    asked = (batch.pictures, batch.text)
+    answer, asked = _text_answer(experiment, mesh) if experiment.baseline is None else _pose_answer(experiment, mesh)
 
-    def decode(trainable: Variables, frozen: Variables, pictures: Picture[Array], text: Text[Array]) -> Decoded:
+    def act(trainable: Variables, frozen: Variables, *asked: object) -> object:
         with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
-            inputs = model_inputs(pictures, text, experiment.encoding)
-            return decode_actions(VLA(experiment.model), join_variables(trainable, frozen), inputs, grammar)
+            return answer(join_variables(trainable, frozen), *asked)
 
+    arguments = (state.trainable, frozen, *asked)
     held = {
         "frozen base": bytes_on_a_device(frozen),
         "trainable": bytes_on_a_device(state.trainable),
         "batch": bytes_on_a_device(asked),
     }
-    counted = sum(prefill_flops(experiment.encoding, experiment.model).values()) * examples
-    lowered = jax.jit(decode).lower(state.trainable, frozen, *asked)
-    return _plan("decoding", lowered, where, mesh, examples, held, counted)
+    if experiment.baseline is None:
+        counted = sum(prefill_flops(experiment.encoding, experiment.model).values()) * examples
+    else:
+        counted = product_flops(jax.make_jaxpr(act)(*arguments).jaxpr) // len(where.devices)
+    return _plan("decoding", jax.jit(act).lower(*arguments), where, mesh, examples, held, counted)
 
 
-def _plan_poses(
-    experiment: Experiment, where: Slice, mesh: Mesh, examples: int, trainable: Variables, frozen: Variables
-) -> Plan:
-    """Observations to actions of a policy that answers with poses."""
+def _text_answer(experiment: Experiment, mesh: Mesh) -> tuple[Callable[..., Decoded], tuple[object, ...]]:
+    """3DS-VLA's decoding as a function of variables and inputs, and the shapes of the inputs."""
+    grammar = build_answer_grammar(planning_tokenizer(experiment), 1, experiment.encoding.style)
+    batch = abstract_batch(experiment, mesh)
+    assert isinstance(batch, Example)
+
+    def answer(variables: Variables, pictures: Picture[Array], text: Text[Array]) -> Decoded:
+        inputs = model_inputs(pictures, text, experiment.encoding)
+        return decode_actions(VLA(experiment.model), variables, inputs, grammar)
+
+    return answer, (batch.pictures, batch.text)
+
+
+def _pose_answer(experiment: Experiment, mesh: Mesh) -> tuple[Callable[..., Array], tuple[object, ...]]:
+    """The same of a policy that answers with poses."""
     assert experiment.baseline is not None
     tokenizer = planning_tokenizer(experiment)
     network = make_network(experiment.baseline, experiment.encoding, experiment.model, tokenizer)
     batch = abstract_batch(experiment, mesh)
     assert isinstance(batch, PoseExample)
-    inputs = batch.inputs
-
-    def act(trainable: Variables, frozen: Variables, inputs: PoseInputs[Array]) -> Array:
-        with jax.sharding.use_abstract_mesh(mesh.abstract_mesh):
-            return network.answer(join_variables(trainable, frozen), inputs, jax.random.key(0))
-
-    held = {
-        "frozen base": bytes_on_a_device(frozen),
-        "trainable": bytes_on_a_device(trainable),
-        "batch": bytes_on_a_device(inputs),
-    }
-    counted = product_flops(jax.make_jaxpr(act)(trainable, frozen, inputs).jaxpr) // len(where.devices)
-    lowered = jax.jit(act).lower(trainable, frozen, inputs)
-    return _plan("decoding", lowered, where, mesh, examples, held, counted)
+    return partial(network.answer, key=jax.random.key(0)), (batch.inputs,)
 
 
 def held_bytes(experiment: Experiment, mesh: Mesh) -> int:

@@ -20,7 +20,7 @@ def robot_width(look_back: int = 0) -> int:
 def robot_vector(inputs: PoseInputs[Array], codec: PoseCodec, look_back: int = 0) -> Float[Array, "b r"]:
     """Each arm's pose and gripper (10), whether it is there, its keypoint from where it is (3), and whether one is.
 
-    look_back: of so many earlier states, pose and gripper of each arm follow, and the number of keyframes in tens.
+    look_back: how many earlier states follow, with pose and gripper of each arm, and then keyframes so far, in tens.
     """
     there = inputs.arms[..., None]
     pose = inputs.robot.pose

@@ -142,7 +142,7 @@ def train(
 def resume(
     checkpoints: RunCheckpoints, state: TrainState, frozen: Variables, batches: Batches
 ) -> tuple[TrainState, Variables]:
-    """Goes on from the newest checkpoint, batches included; saves the frozen variables where there is none.
+    """Resumes from the newest checkpoint, with its place in the data. Without a checkpoint, saves the frozen variables.
 
     Returns the state and the frozen variables to train with. Raises CheckpointError for checkpoints that do not fit.
     """
