@@ -28,7 +28,6 @@ from dsvla_jax.experiment import Experiment, save_experiment
 from dsvla_jax.model.partition import make_sharded
 from dsvla_jax.model.variables import Variables, join_variables
 from dsvla_jax.planner.preflight import check_step
-from dsvla_jax.policies.config import PolicyConfig
 from dsvla_jax.policies.interface import Metrics
 from dsvla_jax.policies.registry import make_learner, make_policy
 from dsvla_jax.policy import save_policy_config
@@ -90,14 +89,13 @@ def train(
     data = open_training_data(experiment, tokenizer, prepared.part)
     held_out = open_validation_data(experiment, tokenizer, prepared.part)
     optimizer = make_optimizer(experiment.optimizer, experiment.steps)
-    learner = make_learner(
-        experiment.baseline,
-        experiment.encoding,
-        experiment.model,
-        tokenizer,
-        experiment.soft_target_sigma,
-        experiment.num_cameras,
+    config = dataclasses.replace(
+        experiment.policy,
+        displacement=data.displacement,
+        vector_scale=data.vector_scale,
+        learned_from=data.learned_from,
     )
+    learner = make_learner(config, tokenizer, experiment.soft_target_sigma, experiment.num_cameras)
     average, regime, model = experiment.optimizer.average_decay, experiment.regime, experiment.model
     start = partial(initial_state, learner, optimizer, experiment.seed, regime, model.frozen_dtype, average > 0)
     base = base_variables(experiment.base, model, tokenizer, regime != "full", mesh)
@@ -105,9 +103,6 @@ def train(
     report_size(state.trainable, frozen, data.samples)
 
     save_experiment(run / "config.json", experiment)
-    config = PolicyConfig(
-        experiment.encoding, experiment.model, data.displacement, data.learned_from, baseline=experiment.baseline
-    )
     save_policy_config(run, config, tokenizer)
     state, frozen = loop.resume(checkpoints, state, frozen, data.batches)
     if state.step:

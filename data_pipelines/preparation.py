@@ -5,12 +5,13 @@ from pathlib import Path
 
 from jax.sharding import Mesh
 
-from data_pipelines.sources import choose_tasks, require_data_fits, require_oxe_fits
+from data_pipelines.sources import choose_tasks, require_data_fits, require_oxe_fits, require_tasks_fit
 from data_pipelines.training_data import with_workspace
 from dsvla_jax.checkpoints.storage import require_writable_path
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.experiment import Experiment
 from dsvla_jax.policies.config import uses_model
+from dsvla_jax.sim.tasks import TASKS
 from dsvla_jax.suite_vocabulary import tokenizer_of
 from dsvla_jax.training.possible import require_possible
 from dsvla_jax.training.run_folder import require_same_experiment
@@ -45,6 +46,7 @@ def prepare(experiment: Experiment, run: Path) -> Prepared:
         tasks = choose_tasks(experiment.data)
         experiment = dataclasses.replace(experiment, data=dataclasses.replace(experiment.data, tasks=tasks))
     require_possible(experiment)
+    instructions_only = experiment.baseline is not None
     mesh = make_mesh(experiment.mesh)
     part = batch_part(mesh, experiment.batch_size, experiment.gradient_accumulation)
     if experiment.base:
@@ -53,9 +55,11 @@ def prepare(experiment: Experiment, run: Path) -> Prepared:
     if experiment.oxe is not None:
         picture = require_oxe_fits(experiment.oxe, experiment.encoding, tokenizer)
     else:
-        picture = require_data_fits(
-            experiment.data, experiment.encoding, tokenizer, held_out, instructions_only=experiment.baseline is not None
-        )
+        picture = require_data_fits(experiment.data, experiment.encoding, tokenizer, held_out, instructions_only)
+    if experiment.evaluate_every:
+        acted = [TASKS[task] for task in experiment.data.tasks]
+        or_else = ", or do not act there while training (--evaluate-every 0)"
+        require_tasks_fit(acted, experiment.encoding, tokenizer, instructions_only, or_else)
     experiment = with_workspace(experiment, run, tokenizer)
     require_same_experiment(run, experiment)
     return Prepared(experiment, tokenizer, mesh, part, picture)

@@ -1,6 +1,7 @@
 """Where a run's demonstrations come from, by ``DataConfig.source``."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +15,7 @@ from dsvla_jax.encoding.pose_inputs import encode_instruction
 from dsvla_jax.encoding.text import Tokenizer, check_words, unknown_words
 from dsvla_jax.errors import UserError
 from dsvla_jax.sim.cameras import check_cameras
-from dsvla_jax.sim.tasks import TASKS, select_tasks
+from dsvla_jax.sim.tasks import TASKS, Task, select_tasks
 
 
 def choose_tasks(data: DataConfig) -> tuple[str, ...]:
@@ -88,25 +89,46 @@ def require_data_fits(
         tasks = [TASKS[task] for task in choose_tasks(data)]
         for task in tasks:
             check_cameras(data.cameras, task.num_arms)
-        texts = [(text, task.num_arms) for task in tasks for text in task.all_instructions()]
-        if unknown := unknown_words([text for text, _ in texts], tokenizer):
-            raise UserError(
-                f"tokenizer: it lacks {len(unknown)} words of the tasks' instructions ({', '.join(unknown[:5])}); "
-                "leave it empty for the words of the task suite"
-            )
+        require_tasks_fit(tasks, encoding, tokenizer, instructions_only)
     else:
         reader, name = _open_folder(data, tokenizer), data.folder
         if held_out:
             open_held_out(data, tokenizer, held_out)
         picture = picture_size(reader.episode(0).rgb_png[0])
         texts = [(text, min(reader.num_arms.values())) for text in reader.instructions]
+        _require_texts_fit(texts, encoding, tokenizer, instructions_only)
     encoding.require_points(*picture, len(data.cameras), f"a picture of {name}")
+    return picture
+
+
+def require_tasks_fit(
+    tasks: Iterable[Task],
+    encoding: EncodingConfig,
+    tokenizer: Tokenizer,
+    instructions_only: bool = False,
+    or_else: str = "",
+) -> None:
+    """Raises UserError where an instruction of a simulated task has unknown words, or is too long.
+
+    instructions_only: as in `require_data_fits`. or_else: what else would mend it.
+    """
+    texts = [(text, task.num_arms) for task in tasks for text in task.all_instructions()]
+    if unknown := unknown_words([text for text, _ in texts], tokenizer):
+        raise UserError(
+            f"tokenizer: it lacks {len(unknown)} words of the tasks' instructions ({', '.join(unknown[:5])}), which "
+            f"the simulator gives; leave it empty for the words of the task suite{or_else}"
+        )
+    _require_texts_fit(texts, encoding, tokenizer, instructions_only)
+
+
+def _require_texts_fit(
+    texts: Iterable[tuple[str, int]], encoding: EncodingConfig, tokenizer: Tokenizer, instructions_only: bool
+) -> None:
     if instructions_only:
         for text, _ in texts:
             encode_instruction(tokenizer, text, encoding.max_text_length)
     else:
         require_texts_fit(encoding, tokenizer, texts)
-    return picture
 
 
 def require_oxe_fits(oxe: OxeConfig, encoding: EncodingConfig, tokenizer: Tokenizer) -> tuple[int, int]:

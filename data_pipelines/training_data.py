@@ -6,8 +6,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypedDict, TypeVar
 
+import jax.numpy as jnp
 import numpy as np
 
+from data_pipelines.episodes import EpisodeReader
 from data_pipelines.first_look import fit_workspace, look_at_demonstrations, look_at_mixture
 from data_pipelines.learned_from import learned_from, learned_from_oxe
 from data_pipelines.loader import make_loader
@@ -17,13 +19,19 @@ from data_pipelines.samples import make_sampler, make_validation_sampler, withou
 from data_pipelines.sources import open_demonstrations, open_held_out
 from dsvla_jax.checkpoints.steps import has_checkpoints
 from dsvla_jax.data_config import DataConfig, LearnedFrom
+from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.text import Tokenizer
+from dsvla_jax.encoding.vector_scale import VectorScale, fit_vector_scale
 from dsvla_jax.experiment import Experiment, load_experiment
+from dsvla_jax.policies.pose_vectors import VECTOR, to_vectors
 from dsvla_jax.training.distributed import first_process_first
 from dsvla_jax.training.loop import Batches
 from dsvla_jax.training.sharding import BatchPart
 from dsvla_jax.types import Example, HeldOutExample, PoseExample
+
+# Frames that the range of vectors is taken from: a few seconds of reading.
+SCALE_FRAMES = 4000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +42,11 @@ class TrainingData:
     """This process's parts of the batches."""
     samples: int
     """How many different samples there are."""
-    displacement: DisplacementScale | None
-    """What displacements are binned over, if the targets are such."""
     learned_from: LearnedFrom
+    displacement: DisplacementScale | None = None
+    """What displacements are binned over, if the targets are such."""
+    vector_scale: VectorScale | None = None
+    """What the answers of a baseline with `normalise` "data" are stretched from."""
 
 
 class _Order(TypedDict):
@@ -60,12 +70,16 @@ def open_training_data(experiment: Experiment, tokenizer: Tokenizer, part: Batch
         loader = OxeLoader(oxe, encoding, tokenizer, batch_size=part.size, **order)
         print(*look_at_mixture(loader.source.datasets, encoding), sep="\n")
         learned = learned_from_oxe(oxe, [len(item.dataset.arms) for item in loader.source.datasets])
-        return TrainingData(loader, loader.num_samples, loader.scale, learned)
+        return TrainingData(loader, loader.num_samples, learned, displacement=loader.scale)
     with first_process_first("demonstrations"):
         reader = open_demonstrations(experiment.data, tokenizer)
     print(look_at_demonstrations(reader, encoding))
     batches = make_loader(reader, training_sampler(experiment, tokenizer), batch_size=part.size, **order)
-    return TrainingData(batches, reader.num_frames, None, learned_from(experiment.data, encoding.use_keypoints))
+    scale = None
+    if experiment.baseline is not None and experiment.baseline.normalise == "data":
+        scale = fit_to_demonstrations(reader, _pose_sampler(experiment, experiment.data, tokenizer), encoding.codec)
+    learned = learned_from(experiment.data, encoding.use_keypoints)
+    return TrainingData(batches, reader.num_frames, learned, vector_scale=scale)
 
 
 Sample = TypeVar("Sample")
@@ -96,6 +110,21 @@ def _pose_sampler(experiment: Experiment, data: DataConfig, tokenizer: Tokenizer
     return make_pose_sampler(
         data, tokenizer, encoding.max_text_length, encoding.use_keypoints, experiment.baseline.upcoming
     )
+
+
+def fit_to_demonstrations(
+    reader: EpisodeReader, sample: Sampler[PoseExample[np.ndarray]], codec: PoseCodec
+) -> VectorScale:
+    """The range of the vectors of keyframes that follow, over frames of all episodes, varied as in training."""
+    rng = np.random.default_rng(0)
+    numbers = np.linspace(0, reader.num_frames - 1, min(reader.num_frames, SCALE_FRAMES)).astype(int)
+    vectors = []
+    for number in numbers:
+        one = sample(reader.frame(int(number)), rng)
+        origin = jnp.asarray(one.inputs.robot.pose[..., :3])
+        found = to_vectors(jnp.asarray(one.pose), jnp.asarray(one.gripper_open), origin, codec)
+        vectors.append(np.asarray(found)[:, one.inputs.arms].reshape(-1, VECTOR))
+    return fit_vector_scale(np.concatenate(vectors))
 
 
 def open_validation_data(

@@ -15,7 +15,7 @@ from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.partition import MESH_AXES
 from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.model.variables import Regime
-from dsvla_jax.policies.config import Baseline, uses_model
+from dsvla_jax.policies.config import Baseline, PolicyConfig, uses_model
 from dsvla_jax.ranges import at_least, check_fields, more_than, require
 
 
@@ -177,6 +177,11 @@ class Experiment(Schedule):
     """Steps after which the policy acts in episodes of the training tasks, and at the end; 0 for never."""
     keep_checkpoints: int = 2
     """The newest checkpoints that stay, besides the best one where steps are validated or evaluated."""
+
+    @property
+    def policy(self) -> PolicyConfig:
+        """What its policy is made of, without what is found in the data."""
+        return PolicyConfig(self.encoding, self.model, baseline=self.baseline)
 
     @property
     def keypoints(self) -> Literal["oracle", "segmentation"]:

@@ -67,7 +67,7 @@ def load_policy(
     """
     config = load_policy_config(run)
     tokenizer = load_vocabulary(run, config)
-    learner = make_learner(config.baseline, config.encoding, config.model, tokenizer)
+    learner = make_learner(config, tokenizer)
     like = jax.eval_shape(learner.initialise, jax.random.key(0))
     if mesh is not None:
         like = jax.tree.map(lambda leaf, where: leaf.update(sharding=where), like, shardings(like, mesh))

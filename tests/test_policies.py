@@ -18,6 +18,7 @@ from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.data_config import DataConfig
 from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.text import WordTokenizer, vocabulary
+from dsvla_jax.encoding.vector_scale import VectorScale
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, OptimizerConfig
 from dsvla_jax.geometry.cameras import front_camera
@@ -151,8 +152,8 @@ def test_a_shifted_world_moves_the_later_keyframes_too():
     np.testing.assert_array_equal(moved.later.pose[..., 3:], frame.later.pose[..., 3:])
 
 
-def learner(baseline: Baseline) -> Any:
-    return make_learner(baseline, ENCODING, MODEL, TOKENIZER)
+def learner(baseline: Baseline, scale: VectorScale | None = None) -> Any:
+    return make_learner(PolicyConfig(ENCODING, MODEL, baseline=baseline, vector_scale=scale), TOKENIZER)
 
 
 @pytest.mark.parametrize("name", BASELINES)

@@ -80,6 +80,7 @@ def test_no_size_or_rate_is_zero_negative_or_not_a_number(toy: Experiment, value
         ("optimizer.warmup_steps", 60, r"optimizer.warmup_steps: expected at most steps \(2\), got 60"),
         ("base", "nowhere", "nowhere: no run here"),
         ("data.source", "simulator", "tokenizer: it lacks"),
+        ("evaluate_every", 2, r"tokenizer: it lacks .*, which the simulator gives; .*--evaluate-every 0\)"),
     ],
 )
 def test_settings_that_contradict_one_another_name_both(toy: Experiment, name: str, value, message, tmp_path: Path):

@@ -78,14 +78,7 @@ def _vocabulary(folder: Path | None) -> Tokenizer:
 def planning_learner(experiment: Experiment) -> ConfiguredLearner:
     """The experiment's policy as it learns, with the vocabulary of `planning_tokenizer`."""
     tokenizer = planning_tokenizer(experiment)
-    return make_learner(
-        experiment.baseline,
-        experiment.encoding,
-        experiment.model,
-        tokenizer,
-        experiment.soft_target_sigma,
-        experiment.num_cameras,
-    )
+    return make_learner(experiment.policy, tokenizer, experiment.soft_target_sigma, experiment.num_cameras)
 
 
 def plan_training(experiment: Experiment, where: Slice, examples: int) -> Plan:
@@ -151,9 +144,7 @@ def _text_answer(experiment: Experiment, mesh: Mesh) -> tuple[Callable[..., Deco
 
 def _pose_answer(experiment: Experiment, mesh: Mesh) -> tuple[Callable[..., Array], tuple[object, ...]]:
     """The same of a policy that answers with poses."""
-    assert experiment.baseline is not None
-    tokenizer = planning_tokenizer(experiment)
-    network = make_network(experiment.baseline, experiment.encoding, experiment.model, tokenizer)
+    network = make_network(experiment.policy, planning_tokenizer(experiment))
     batch = abstract_batch(experiment, mesh)
     assert isinstance(batch, PoseExample)
     return partial(network.answer, key=jax.random.key(0)), (batch.inputs,)

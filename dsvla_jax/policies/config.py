@@ -6,6 +6,7 @@ from typing import Literal
 from dsvla_jax.data_config import LearnedFrom
 from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.displacement import DisplacementScale
+from dsvla_jax.encoding.vector_scale import VectorScale
 from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.same_sizes import require_same_sizes
 from dsvla_jax.ranges import at_least, check_fields, require
@@ -23,6 +24,9 @@ class BehaviourCloningConfig:
     """Which policy this is."""
     upcoming: int = 1
     """Keyframes that are learned from every frame on; the first is executed."""
+    normalise: Literal["box", "data"] = "box"
+    """The range of what is learned. box: positions in half sides of the codec's box. data: every number also stretched
+    from its range in the demonstrations to -1 to 1."""
     hidden: int = 256
     """Width of the head's two hidden layers."""
     rotation_weight: float = 1.0
@@ -49,6 +53,9 @@ class DP3Config:
     """Which policy this is."""
     upcoming: int = 4
     """Keyframes that are denoised together; the first is executed."""
+    normalise: Literal["box", "data"] = "box"
+    """The range of what is learned. box: positions in half sides of the codec's box. data: every number also stretched
+    from its range in the demonstrations to -1 to 1."""
     look_back: int = 0
     """Earlier states of the robot that it reads, at most 4, with the number of keyframes so far; 0 for neither."""
     colours: bool = True
@@ -102,6 +109,8 @@ class PolicyConfig:
     model: ModelConfig
     displacement: DisplacementScale | None = None
     """The range of answers that say where to go from the present pose; None for answers that are poses."""
+    vector_scale: VectorScale | None = None
+    """The range of what a baseline with `normalise` "data" answers with."""
     learned_from: LearnedFrom | None = None
     """None for runs of versions that did not keep it."""
     vocabulary: str | None = None

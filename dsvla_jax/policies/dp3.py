@@ -24,7 +24,7 @@ from dsvla_jax.model.variables import Variables
 from dsvla_jax.policies.config import DP3_GROUPS, DP3_HEADS, DP3Config
 from dsvla_jax.policies.diffusion import add_noise, denoise, signal_shares
 from dsvla_jax.policies.pose_network import Vectors, mean_over_arm
-from dsvla_jax.policies.pose_vectors import LARGEST, VECTOR, center, scale_position
+from dsvla_jax.policies.pose_vectors import VECTOR, VectorSpace, center, scale_position
 from dsvla_jax.policies.robot_vector import robot_vector, robot_width, with_waves
 from dsvla_jax.types import Array, PoseInputs, Text
 
@@ -170,6 +170,7 @@ class DP3:
 
     config: DP3Config
     encoding: EncodingConfig
+    space: VectorSpace
     vocabulary: int
     """Tokens that an instruction may have."""
 
@@ -232,6 +233,6 @@ class DP3:
             noise,
             self._shares,
             self.config.inference_steps,
-            np.tile(LARGEST, ARMS),
+            np.tile(self.space.largest, ARMS),
         )
         return clean.reshape(*shape[:2], ARMS, VECTOR)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dsvla_jax.encoding.codec import PoseCodec
 from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.pose_inputs import encode_instruction, pose_example_spec, pose_inputs
 from dsvla_jax.encoding.prompts import format_answer
@@ -19,9 +18,9 @@ from dsvla_jax.geometry.rotations import rotation_distance
 from dsvla_jax.model.variables import Regime, Variables
 from dsvla_jax.policies.config import PolicyConfig
 from dsvla_jax.policies.interface import Decision, Metrics, filled_up
-from dsvla_jax.policies.networks import make_network
+from dsvla_jax.policies.networks import make_network, vector_space
 from dsvla_jax.policies.pose_network import PoseNetwork, Vectors
-from dsvla_jax.policies.pose_vectors import from_vectors, to_vectors
+from dsvla_jax.policies.pose_vectors import VectorSpace
 from dsvla_jax.policies.traced_flops import product_flops
 from dsvla_jax.types import Action, Array, Observation, PoseExample, PoseInputs, RobotState, Text
 
@@ -36,6 +35,7 @@ class PoseLearner:
 
     network: PoseNetwork
     encoding: EncodingConfig
+    space: VectorSpace
     cameras: int = 1
     """C, in its examples."""
 
@@ -54,20 +54,20 @@ class PoseLearner:
     ) -> tuple[Array, Metrics]:
         """See `Learner`. Where answers cost nothing, their errors are among the metrics."""
         (count,), there = totals, part.inputs.arms
-        target = target_vectors(part, self.encoding.codec)
+        target = target_vectors(part, self.space)
         losses, vectors = self.network.losses(variables, part.inputs, target, key)
         loss = jnp.where(there, losses, 0).sum() / count
-        metrics = {} if vectors is None else answer_errors(vectors, part, self.encoding.codec)
+        metrics = {} if vectors is None else answer_errors(vectors, part, self.space)
         return loss, {"loss": loss, **{name: jnp.where(there, x, 0).sum() / count for name, x in metrics.items()}}
 
     def errors(self, variables: Variables, batch: PoseExample[Array], key: Array) -> dict[str, tuple[Array, Array]]:
         """See `Learner`."""
         there = batch.inputs.arms
-        target = target_vectors(batch, self.encoding.codec)
+        target = target_vectors(batch, self.space)
         losses, vectors = self.network.losses(variables, batch.inputs, target, key)
         if vectors is None:
             vectors = self.network.answer(variables, batch.inputs, jax.random.key(ANSWER_SEED))
-        errors = {"loss": losses, **answer_errors(vectors, batch, self.encoding.codec)}
+        errors = {"loss": losses, **answer_errors(vectors, batch, self.space)}
         return {name: (jnp.where(there, error, 0).sum(), there.sum()) for name, error in errors.items()}
 
     def tokens(self, batch: PoseExample) -> int:
@@ -91,19 +91,19 @@ class PoseLearner:
         return pose_example_spec(batch, cameras, height, width, self.encoding.max_text_length, self.network.upcoming)
 
 
-def target_vectors(batch: PoseExample[Array], codec: PoseCodec) -> Vectors:
+def target_vectors(batch: PoseExample[Array], space: VectorSpace) -> Vectors:
     """What is learned: the keyframes that follow, from where each arm is."""
-    return to_vectors(batch.pose, batch.gripper_open, batch.inputs.robot.pose[:, None, :, :3], codec)
+    return space.to_vectors(batch.pose, batch.gripper_open, batch.inputs.robot.pose[:, None, :, :3])
 
 
-def first_keyframe(vectors: Vectors, inputs: PoseInputs[Array], codec: PoseCodec) -> Action[Array]:
+def first_keyframe(vectors: Vectors, inputs: PoseInputs[Array], space: VectorSpace) -> Action[Array]:
     """The keyframe to execute, of both arms."""
-    return from_vectors(vectors[:, 0], inputs.robot.pose[..., :3], codec)
+    return space.from_vectors(vectors[:, 0], inputs.robot.pose[..., :3])
 
 
-def answer_errors(vectors: Vectors, batch: PoseExample[Array], codec: PoseCodec) -> dict[str, Float[Array, "b 2"]]:
+def answer_errors(vectors: Vectors, batch: PoseExample[Array], space: VectorSpace) -> dict[str, Float[Array, "b 2"]]:
     """Compares the first keyframe of answers with the demonstration's, for each arm."""
-    answer = first_keyframe(vectors, batch.inputs, codec)
+    answer = first_keyframe(vectors, batch.inputs, space)
     pose, gripper = batch.pose[:, 0], batch.gripper_open[:, 0]
     return {
         "position_cm": 100 * jnp.linalg.norm(answer.pose[..., :3] - pose[..., :3], axis=-1),
@@ -112,9 +112,11 @@ def answer_errors(vectors: Vectors, batch: PoseExample[Array], codec: PoseCodec)
     }
 
 
-@partial(jax.jit, static_argnames=("network", "codec"))
-def _act(network: PoseNetwork, codec: PoseCodec, variables: Variables, inputs: PoseInputs[Array], key: Array) -> Action:
-    return first_keyframe(network.answer(variables, inputs, key), inputs, codec)
+@partial(jax.jit, static_argnames=("network", "space"))
+def _act(
+    network: PoseNetwork, space: VectorSpace, variables: Variables, inputs: PoseInputs[Array], key: Array
+) -> Action:
+    return first_keyframe(network.answer(variables, inputs, key), inputs, space)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,13 +130,12 @@ class PosePolicy:
     @property
     def network(self) -> PoseNetwork:
         """The network that answers."""
-        assert self.config.baseline is not None
-        return make_network(self.config.baseline, self.config.encoding, self.config.model, self.tokenizer)
+        return make_network(self.config, self.tokenizer)
 
     @property
-    def codec(self) -> PoseCodec:
-        """The box of positions, and how an answer is written as text."""
-        return self.config.encoding.codec
+    def space(self) -> VectorSpace:
+        """What its vectors count in."""
+        return vector_space(self.config)
 
     def encode_prompt(
         self, instruction: str, robot: RobotState[np.ndarray], keypoints: Float[np.ndarray, "a 3"] | None
@@ -174,7 +175,7 @@ class PosePolicy:
             near = np.asarray(keypoints, np.float32)
         inputs = pose_inputs(observation.pictures, robot, words, near, observation.past)
         key = jax.random.key(ANSWER_SEED) if key is None else key
-        action = _act(self.network, self.codec, self.variables, filled_up(inputs, size), key)
+        action = _act(self.network, self.space, self.variables, filled_up(inputs, size), key)
         action = Action(action.pose[:size, :arms], action.gripper_open[:size, :arms])
         return Decision(action, action_texts(action, self.config))
 
@@ -211,7 +212,7 @@ class PoseOnDevice:
         near = keypoints if self.policy.config.wants_keypoints else None
         inputs = pose_inputs(observation.pictures, observation.robot, question, near, observation.past)
         vectors = self.policy.network.answer(variables, inputs, jax.random.key(ANSWER_SEED))
-        action = first_keyframe(vectors, inputs, self.policy.codec)
+        action = first_keyframe(vectors, inputs, self.policy.space)
         action = Action(action.pose[:, : self.arms], action.gripper_open[:, : self.arms])
         return action, action
 

@@ -6,11 +6,14 @@ Representations in Neural Networks", section 4.2); and the gripper, 1 for open a
 answer is where the arm is, so that an answer stays the same when the world is shifted.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from dsvla_jax.encoding.codec import PoseCodec
+from dsvla_jax.encoding.vector_scale import VectorScale
 from dsvla_jax.geometry.rotations import matrix_to_quaternion, normalize, quaternion_to_matrix
 from dsvla_jax.types import Action, Array
 
@@ -57,3 +60,27 @@ def from_vectors(vectors: Float[Array, "*b 10"], origin: Float[Array, "*c 3"], c
     matrix = jnp.stack([first, second, jnp.cross(first, second)], axis=-1)
     pose = jnp.concatenate([position, matrix_to_quaternion(matrix)], axis=-1)
     return Action(pose, (vectors[..., GRIPPER] > 0).astype(jnp.float32))
+
+
+@dataclasses.dataclass(frozen=True)
+class VectorSpace:
+    """What a network's vectors count in: half sides of the codec's box, and then the range of the data, if fitted."""
+
+    codec: PoseCodec
+    scale: VectorScale | None = None
+
+    @property
+    def largest(self) -> np.ndarray:
+        """float32 (10,): the largest absolute value of each number."""
+        return LARGEST if self.scale is None else np.ones(VECTOR, np.float32)
+
+    def to_vectors(
+        self, pose: Float[Array, "*b 7"], gripper_open: Float[Array, "*b"], origin: Float[Array, "*c 3"]
+    ) -> Float[Array, "*b 10"]:
+        """See `to_vectors`."""
+        vectors = to_vectors(pose, gripper_open, origin, self.codec)
+        return vectors if self.scale is None else self.scale.to_unit(vectors)
+
+    def from_vectors(self, vectors: Float[Array, "*b 10"], origin: Float[Array, "*c 3"]) -> Action[Array]:
+        """See `from_vectors`."""
+        return from_vectors(vectors if self.scale is None else self.scale.from_unit(vectors), origin, self.codec)

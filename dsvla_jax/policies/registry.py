@@ -2,14 +2,12 @@
 
 from typing import Any
 
-from dsvla_jax.encoding.config import EncodingConfig
 from dsvla_jax.encoding.text import Tokenizer
-from dsvla_jax.model.config import ModelConfig
 from dsvla_jax.model.decode import GREEDY, Decoding
 from dsvla_jax.model.variables import Variables
-from dsvla_jax.policies.config import Baseline, PolicyConfig
+from dsvla_jax.policies.config import PolicyConfig
 from dsvla_jax.policies.interface import Learner, Policy
-from dsvla_jax.policies.networks import make_network
+from dsvla_jax.policies.networks import make_network, vector_space
 from dsvla_jax.policies.pose_policy import PoseLearner, PosePolicy
 from dsvla_jax.policies.three_ds_vla import TextPolicy, text_learner
 
@@ -18,21 +16,15 @@ ConfiguredLearner = Learner[Any, Any]
 
 
 def make_learner(
-    baseline: Baseline | None,
-    encoding: EncodingConfig,
-    model: ModelConfig,
-    tokenizer: Tokenizer,
-    soft_target_sigma: float = 0.0,
-    cameras: int = 1,
+    config: PolicyConfig, tokenizer: Tokenizer, soft_target_sigma: float = 0.0, cameras: int = 1
 ) -> ConfiguredLearner:
     """How a policy learns, from examples of its own kind.
 
-    baseline: None for 3DS-VLA. soft_target_sigma: see `text_learner`. cameras: C, in examples.
+    soft_target_sigma: see `text_learner`. cameras: C, in examples.
     """
-    if baseline is None:
-        return text_learner(encoding, model, tokenizer, soft_target_sigma)
-    network = make_network(baseline, encoding, model, tokenizer)
-    return PoseLearner(network, encoding, cameras)
+    if config.baseline is None:
+        return text_learner(config.encoding, config.model, tokenizer, soft_target_sigma)
+    return PoseLearner(make_network(config, tokenizer), config.encoding, vector_space(config), cameras)
 
 
 def make_policy(
