@@ -5,6 +5,9 @@ import dataclasses
 import functools
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +124,19 @@ def test_oxe_pictures_must_have_the_points_of_the_tokenizer(toy: Experiment, tmp
 def test_what_no_machine_can_hold_is_refused_before_it_is_allocated(toy: Experiment):
     mesh = make_mesh(MeshConfig(), jax.devices()[:1])
     for name, message in (
-        ("model.language.ffn", r"parameters and optimizer take [\d,.]+ GiB of each device"),
+        ("model.language.ffn", r"parameters, gradient and optimizer take [\d,.]+ GiB of each device"),
         ("batch_size", r"batch_size: an array of shape .* takes [\d,.]+ GiB of each device"),
     ):
         with pytest.raises(UserError, match=message):
             check_step(OddSetting(name, 2**31 - 1).apply(toy), mesh, (32, 32))
+
+
+def test_the_memory_of_processors_is_what_the_process_is_allowed():
+    show = "from dsvla_jax.planner.preflight import device_memory; print(device_memory())"
+    command = f"ulimit -v {6 * 2**20}; exec {sys.executable} -c '{show}'"
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "2"}
+    printed = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=True)
+    assert float(printed.stdout) == 3 * 2**30
 
 
 def test_zero_means_never_for_all_that_is_done_every_so_many_steps(toy: Experiment):

@@ -2,7 +2,9 @@
 
 import math
 import os
+import resource
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import jax.core
@@ -25,11 +27,12 @@ def check_step(experiment: Experiment, mesh: Mesh, picture: tuple[int, int]) -> 
     """
     state, frozen, _ = abstract_state(experiment, mesh)
     memory = device_memory()
-    held = bytes_on_a_device((state, frozen))
+    # The gradient of everything that is trained is there when the optimizer measures its norm.
+    held = bytes_on_a_device((state, frozen, state.trainable))
     if held > memory:
         raise UserError(
-            f"model: parameters and optimizer take {_gib(held)} of each device, which has {_gib(memory)}; use a smaller"
-            " model, regime lora, or split them over more devices (--mesh.fsdp)"
+            f"model: parameters, gradient and optimizer take {_gib(held)} of each device, which has {_gib(memory)}; use"
+            " a smaller model, regime lora, or split them over more devices (--mesh.fsdp)"
         )
     batch = abstract_batch(experiment, mesh, picture)
 
@@ -49,13 +52,33 @@ def check_step(experiment: Experiment, mesh: Mesh, picture: tuple[int, int]) -> 
 
 
 def device_memory() -> float:
-    """Bytes of one device; those of the machine's memory, shared by its devices, for processors; inf if unknown."""
+    """Bytes of one device; for processors of the memory that this process may have, shared by them; inf if unknown."""
     devices = jax.local_devices()
     if limit := (devices[0].memory_stats() or {}).get("bytes_limit"):
         return limit
     if devices[0].platform != "cpu":
         return math.inf
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / len(devices)
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min([machine, *_limits()]) / len(devices)
+
+
+def _limits() -> Iterator[int]:
+    """Bytes that `ulimit -v`, a container or a cluster's job allows this process, where they set a limit."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY:
+        yield limit
+    groups = Path("/proc/self/cgroup")
+    for line in groups.read_text().splitlines() if groups.exists() else ():
+        _, controllers, group = line.split(":", 2)
+        folder = Path("/sys/fs/cgroup")
+        if not controllers:
+            file = folder / group.lstrip("/") / "memory.max"
+        elif "memory" in controllers.split(","):
+            file = folder / "memory" / group.lstrip("/") / "memory.limit_in_bytes"
+        else:
+            continue
+        if file.exists() and (limit := file.read_text().strip()) != "max":
+            yield int(limit)
 
 
 def _outputs(jaxpr: jax.extend.core.Jaxpr) -> Iterator[jax.core.ShapedArray]:
