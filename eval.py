@@ -36,6 +36,7 @@ from dsvla_jax.evaluation.results import (
     require_writable,
     write_results,
 )
+from dsvla_jax.evaluation.withheld import check_parts, withholding
 from dsvla_jax.experiment import Experiment, load_experiment, require_simulated
 from dsvla_jax.files import write_picture
 from dsvla_jax.model.decode import Decoding
@@ -74,6 +75,9 @@ class Options:
     """Metres of uniform noise an axis on every keypoint (paper, section 4.3: up to 0.1)."""
     shift: tuple[str, ...] = ()
     """Test conditions unlike those of training (paper, Table 4): instance, position, background, camera."""
+    withhold: tuple[str, ...] = ()
+    """Parts of its observations that the policy is denied: colour (grey pictures), depth (no points), keypoint, or
+    own_pictures (it gets those of another episode)."""
     choice: Literal["greedy", "expected"] = "greedy"
     """Take the most probable integer of each number, or the one nearest to its mean."""
     step: int | Literal["best"] | None = None
@@ -100,6 +104,7 @@ class Options:
         if self.loop == "device":
             require(self.physics == "mjx", "loop", "'host' with physics 'mujoco'", "'device'", "add --physics mjx")
             found = "found before every keyframe"
+            require(not self.withhold, "loop", "'host' with inputs withheld", "'device'", "leave out --withhold")
             once = self.keypoints != "segmentation-refresh"
             require(once, "loop", f"'host' with keypoints that are {found}", "'device'", "use --keypoints segmentation")
 
@@ -165,6 +170,7 @@ def conditions_of(options: Options, experiment: Experiment, step: int, digest: s
         keypoints=options.keypoints or experiment.keypoints,
         keypoint_noise=options.keypoint_noise,
         shifts=check_shifts(options.shift),
+        withheld=check_parts(options.withhold),
         seed=options.seed,
         choice=options.choice,
         image_size=experiment.data.image_size,
@@ -182,6 +188,7 @@ def compared(run: Path, options: Options) -> list[EpisodeResult]:
         "loop": options.loop,
         "keypoint_noise": options.keypoint_noise,
         "shifts": check_shifts(options.shift),
+        "withheld": check_parts(options.withhold),
         "seed": options.seed,
         "choice": options.choice,
         **({"step": options.step} if isinstance(options.step, int) else {}),
@@ -203,7 +210,7 @@ def compared(run: Path, options: Options) -> list[EpisodeResult]:
 
 def _asked(options: Options) -> Iterator[tuple[str, str]]:
     """The options that name other conditions than those of a plain evaluation, as on the command line."""
-    for name in ("physics", "loop", "keypoints", "keypoint_noise", "shift", "choice", "step", "seed"):
+    for name in ("physics", "loop", "keypoints", "keypoint_noise", "shift", "withhold", "choice", "step", "seed"):
         value, plain = getattr(options, name), getattr(Options, name)
         if value != plain:
             yield name.replace("_", "-"), " ".join(value) if isinstance(value, tuple) else str(value)
@@ -220,10 +227,10 @@ def evaluate_task(
         shifts=options.shift,
         cameras=experiment.data.cameras,
     )
-    on_device = options.loop == "device"
+    on_device, act = options.loop == "device", withholding(policy.act, check_parts(options.withhold))
     return run_task(
         environment,
-        DeviceLoop(environment, policy) if on_device else on_host(environment, policy.act),
+        DeviceLoop(environment, policy) if on_device else on_host(environment, act),
         episodes,
         split="eval",
         seed=options.seed,

@@ -31,6 +31,8 @@ class Conditions:
     """How integers are chosen from their distributions."""
     image_size: int | None = None
     """Pixels a side of the pictures; None if not recorded."""
+    withheld: tuple[str, ...] = ()
+    """The parts of its observations that the policy was denied, see `withheld.py`."""
 
     @property
     def name(self) -> str:
@@ -46,6 +48,7 @@ class Conditions:
         if self.keypoint_noise:
             parts.append(f"keypoint noise {self.keypoint_noise:g} m")
         parts += [f"{name} shifted" for name in self.shifts]
+        parts += [f"without {name.replace('_', ' ')}" for name in self.withheld]
         if self.choice != "greedy":
             parts.append(self.choice)
         if self.seed:
@@ -58,5 +61,5 @@ def conditions_from_json(fields: dict[str, Json]) -> Conditions:
 
     Raises TypeError for fields that `Conditions` does not have.
     """
-    shifts = fields.get("shifts", ())
-    return Conditions(**{**fields, "shifts": tuple(shifts) if isinstance(shifts, list) else shifts})  # type: ignore[arg-type]
+    lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
+    return Conditions(**{**fields, **lists})  # type: ignore[arg-type]
