@@ -1,4 +1,4 @@
-"""Every field of every config with zero, negative, huge and contradicting values: refused, or two steps (10 minutes).
+"""Every field of every config with zero, negative, huge and contradicting values: refused, or two steps (30 minutes).
 
 Usage: python -m benchmarks.odd_settings [--only model.vision --folder DIR]
 

@@ -112,12 +112,12 @@ class OxeConfig:
         check_fields(
             self,
             "oxe",
-            horizon=at_least(0),
+            horizon=at_least(0, at_most=3600),
             image_size=at_least(1),
             crop=more_than(0, at_most=1),
             colour_variation=SHARE,
             window=at_least(1),
-            streams=at_least(1),
+            streams=at_least(1, at_most=4096),
         )
         require_folder("oxe.folder", self.folder)
         # None at all is for programs that read a single build, which no mixture names.

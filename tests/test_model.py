@@ -139,7 +139,7 @@ def test_attention_equals_loops_in_numpy():
         scores = key[b, h // 2] @ query[b, h, t] / np.sqrt(8)
         weights = np.where(mask[b, t], np.exp(scores), 0)
         expected[b, h, t] = weights @ value[b, h // 2] / weights.sum()
-    for implementation in ("auto", "explicit", "fused"):
+    for implementation in ("auto", "explicit", "fused", "cudnn"):
         arrays = jnp.asarray(query), jnp.asarray(key), jnp.asarray(value), jnp.asarray(mask)
         result = attend(*arrays, implementation)
         np.testing.assert_allclose(result, expected, atol=1e-5)

@@ -82,6 +82,7 @@ def test_no_size_or_rate_is_zero_negative_or_not_a_number(toy: Experiment, value
         ("model.language.vocab_size", 40, "model.language.vocab_size is 40; they must be of one language model"),
         ("optimizer.warmup_steps", 60, r"optimizer.warmup_steps: expected at most steps \(2\), got 60"),
         ("base", "nowhere", "nowhere: no run here"),
+        ("model.attention", "cudnn", "model.dtype: expected bfloat16 with attention 'cudnn', got float32"),
         ("data.source", "simulator", "tokenizer: it lacks"),
         ("evaluate_every", 2, r"tokenizer: it lacks .*, which the simulator gives; .*--evaluate-every 0\)"),
     ],
@@ -108,11 +109,23 @@ def test_odd_but_possible_settings_train(toy: Experiment, changes: dict[str, Any
     assert math.isfinite(last["loss"])
 
 
+def test_a_kernel_that_this_machine_lacks_is_refused(toy: Experiment, tmp_path: Path):
+    model = dataclasses.replace(toy.model, dtype="bfloat16", attention="cudnn")
+    with pytest.raises(UserError, match="model.attention: 'cudnn' is a kernel of NVIDIA's GPUs, and JAX has cpu here"):
+        prepare(dataclasses.replace(toy, model=model), tmp_path / "run")
+
+
 def test_index_order_has_a_patch_for_every_token(toy: Experiment):
     encoding = dataclasses.replace(toy.encoding, alignment="index_order")
     points = dataclasses.replace(encoding.points, group_sizes=(16, 5), num_points=32)
     with pytest.raises(UserError, match="at most 4 tokens at the end with alignment index_order, one a patch, got 5"):
         dataclasses.replace(toy, encoding=dataclasses.replace(encoding, points=points))
+
+
+@pytest.mark.parametrize("changes", [{"horizon": 1e30}, {"streams": 10**6}])
+def test_no_oxe_setting_is_beyond_what_a_mixture_can_have(changes: dict[str, Any]):
+    with pytest.raises(UserError, match=r"oxe\.(horizon|streams): expected at least \d, at most \d+"):
+        OxeConfig(**changes)
 
 
 def test_oxe_pictures_must_have_the_points_of_the_tokenizer(toy: Experiment, tmp_path: Path):

@@ -165,6 +165,12 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
         self.config, self.seed = config, seed
         self.datasets, self.weights = open_mixture(config, progress)
         self.shares = shares_of(self.datasets, self.weights)
+        for source in self.datasets:
+            if len(source.index.samples) < config.streams:
+                raise UserError(
+                    f"{source.build.folder}: {len(source.index.samples)} usable episodes cannot be dealt to"
+                    f" {config.streams} streams; lower `streams` to that, or leave the dataset out"
+                )
         window = max(1, -(-config.window // config.streams))
         self._schedules = [schedule(self.shares, [seed, stream]) for stream in range(config.streams)]
         # The same for every stream.
@@ -172,11 +178,6 @@ class MixtureSource(grain.sources.RandomAccessDataSource[EncodedSample]):
         self._streams = []
         for number, source in enumerate(self.datasets):
             dealt = deal(len(source.index.samples), config.streams, [seed, number])
-            if not all(len(episodes) for episodes in dealt):
-                raise UserError(
-                    f"{source.build.folder}: {len(source.index.samples)} usable episodes cannot be dealt to"
-                    f" {config.streams} streams; lower `streams` to that, or leave the dataset out"
-                )
             # As many blocks as those numbers can span, and some more since blocks differ in size: with fewer, threads
             # would take each other's away.
             spanned = at_once / config.streams * self.shares[number] / (window * source.index.samples.mean())

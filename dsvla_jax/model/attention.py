@@ -21,6 +21,11 @@ def join_heads(x: Array) -> Array:
     return x.swapaxes(1, 2).reshape(batch, length, heads * depth)
 
 
+def has_cudnn() -> bool:
+    """Whether attention can be one cuDNN kernel here."""
+    return jax.default_backend() == "gpu"
+
+
 def attend(query: Array, key: Array, value: Array, mask: Array | None = None, implementation: str = "auto") -> Array:
     """Softmax attention, the softmax in float32.
 
@@ -33,6 +38,9 @@ def attend(query: Array, key: Array, value: Array, mask: Array | None = None, im
     kv_heads = key.shape[1]
     if implementation == "auto":
         implementation = "explicit" if jax.default_backend() == "cpu" else "fused"
+    if implementation == "cudnn" and not has_cudnn():
+        # What was trained on a GPU acts elsewhere too.
+        implementation = "fused"
     if implementation != "explicit":
         output = jax.nn.dot_product_attention(
             query.swapaxes(1, 2),

@@ -295,7 +295,7 @@ class ModelConfig:
     attention: Literal["auto", "explicit", "fused", "cudnn"] = "auto"
     """explicit: two batched products over head-major arrays, the fastest on CPU. fused: jax.nn.dot_product_attention as
     XLA compiles it. cudnn: the same as one cuDNN kernel (NVIDIA, bfloat16, cuDNN's limits on lengths). auto: explicit
-    on a CPU, fused elsewhere."""
+    on a CPU, fused elsewhere. A policy of a run with cudnn acts with fused where there is no such GPU."""
     scan_unroll: int = 1
     """Layers per iteration of the loop over layers. More layers cost compile time and save loop overhead. With all
     layers of the language model, training also skips what its last layer would compute for visual tokens."""
@@ -308,6 +308,8 @@ class ModelConfig:
             f"the vision width {self.vision.width}, because 3D tokens enter the vision tower unprojected",
             self.point_width,
         )
+        kernel = self.attention == "cudnn" and self.dtype != "bfloat16"
+        require(not kernel, "model.dtype", "bfloat16 with attention 'cudnn'", self.dtype)
         if self.fusion == "adapter":
             require(
                 self.projector == "linear",

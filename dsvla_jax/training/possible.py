@@ -4,6 +4,7 @@ import jax
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.experiment import Experiment, OptimizerConfig
+from dsvla_jax.model.attention import has_cudnn
 from dsvla_jax.sim.cameras import check_cameras
 from dsvla_jax.sim.tasks import get_task, select_tasks
 
@@ -14,6 +15,10 @@ def require_possible(experiment: Experiment) -> None:
     # The default suits every run, because warm-up is a fifth of it at most.
     if warmup > experiment.steps and warmup != OptimizerConfig().warmup_steps:
         raise UserError(f"optimizer.warmup_steps: expected at most steps ({experiment.steps}), got {warmup}")
+    if experiment.model.attention == "cudnn" and not has_cudnn():
+        raise UserError(
+            f"model.attention: 'cudnn' is a kernel of NVIDIA's GPUs, and JAX has {jax.default_backend()} here; use auto"
+        )
     if experiment.baseline is not None and experiment.oxe is not None:
         raise UserError("baseline: Open X-Embodiment mixtures are written as 3DS-VLA's text; leave one of the two out")
     if experiment.evaluate_every:
