@@ -8,6 +8,7 @@ Axes: F recorded frames of an episode, and A, C, H, W, K of ``dsvla_jax.types``.
 """
 
 import dataclasses
+import math
 import struct
 from collections.abc import Sequence
 from typing import Any, cast
@@ -108,7 +109,7 @@ def encode_rgb(rgb: np.ndarray) -> bytes:
     """PNG of uint8 (H, W, 3)."""
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[-1] != 3:
         raise DataError("encode_rgb", "rgb", "uint8 (H, W, 3)", f"{rgb.dtype} {rgb.shape}", "convert the picture first")
-    return _png(np.ascontiguousarray(rgb[..., ::-1]))
+    return _png(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
 def encode_depth(depth: np.ndarray) -> bytes:
@@ -133,7 +134,7 @@ def decode_rgb(data: bytes) -> np.ndarray:
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise DataError("decode_rgb", "rgb_png", "a PNG", f"{len(data)} undecodable bytes", "generate the data again")
-    return np.ascontiguousarray(picture[..., ::-1])
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def decode_depth(data: bytes) -> np.ndarray:
@@ -230,7 +231,7 @@ def check_episode(episode: Episode, where: object) -> None:
         value = getattr(episode, field)
         if value.shape != shape or value.dtype != np.float32:
             raise DataError(where, field, f"float32 {shape}", f"{value.dtype} {value.shape}", fix)
-        if not np.all(np.isfinite(value)):
+        if not np.isfinite(value).all():
             raise DataError(where, field, "finite numbers", f"{int(np.sum(~np.isfinite(value)))} non-finite", fix)
 
 
@@ -298,9 +299,14 @@ def _unpack_array(value: object, where: object, field: str) -> np.ndarray:
     if not isinstance(value, dict) or value.get("dtype") not in _DTYPES:
         raise DataError(where, field, f"an array of {_DTYPES}", repr(value)[:60], "generate the data again")
     dtype, shape, data = np.dtype(value["dtype"]), tuple(value["shape"]), value["data"]
-    if len(data) != dtype.itemsize * int(np.prod(shape)):
+    if len(data) != dtype.itemsize * math.prod(shape):
         raise DataError(where, field, f"the bytes of {shape}", f"{len(data)} bytes", "generate the data again")
     return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """The pictures of C cameras as one array; that of one camera is not copied."""
+    return pictures[0][None] if len(pictures) == 1 else np.stack(pictures)
 
 
 def decode_frame(episode: Episode, place: int, task_index: int = 0, episode_number: int = 0) -> Frame:
@@ -308,8 +314,8 @@ def decode_frame(episode: Episode, place: int, task_index: int = 0, episode_numb
     mine = slice(place * episode.num_cameras, (place + 1) * episode.num_cameras)
     return Frame(
         pictures=Picture(
-            np.stack([decode_rgb(png) for png in episode.rgb_png[mine]]),
-            np.stack([decode_depth(png) for png in episode.depth_png[mine]]),
+            _stack([decode_rgb(png) for png in episode.rgb_png[mine]]),
+            _stack([decode_depth(png) for png in episode.depth_png[mine]]),
             Camera(episode.intrinsics[place].copy(), episode.world_from_camera[place].copy()),
         ),
         robot=RobotState(episode.pose[place].copy(), episode.gripper_open[place].copy()),

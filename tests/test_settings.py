@@ -111,7 +111,7 @@ def test_odd_but_possible_settings_train(toy: Experiment, changes: dict[str, Any
 
 def test_a_kernel_that_this_machine_lacks_is_refused(toy: Experiment, tmp_path: Path):
     model = dataclasses.replace(toy.model, dtype="bfloat16", attention="cudnn")
-    with pytest.raises(UserError, match="model.attention: 'cudnn' is a kernel of NVIDIA's GPUs, and JAX has cpu here"):
+    with pytest.raises(UserError, match=r"model.attention: 'cudnn' is a kernel of NVIDIA's GPUs, and JAX has cpu here"):
         prepare(dataclasses.replace(toy, model=model), tmp_path / "run")
 
 

@@ -5,6 +5,7 @@ frame. Quaternion components are counted in hundredths. The gripper is 0 or 1.
 """
 
 import dataclasses
+import functools
 from types import ModuleType
 
 import jax.numpy as jnp
@@ -41,17 +42,23 @@ class PoseCodec:
         require_box("encoding.codec.low", self.low, "high", self.high)
         require(bool((self.step > 1e-6).all()), "encoding.codec.bins", "steps of more than 1e-6 metres", self.step)
 
-    @property
+    # Cached: the data loader asks for them several times a sample.
+    @functools.cached_property
     def step(self) -> np.ndarray:
         """float32 (3,): metres in one step of each axis, also the largest gap between neighbouring positions."""
         return ((np.array(self.high, np.float64) - np.array(self.low, np.float64)) / self.bins).astype(np.float32)
 
+    @functools.cached_property
+    def _ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """float32 (3,) each: the integers of the box's corners."""
+        low, high = (np.round(np.array(corner) / self.step) for corner in (self.low, self.high))
+        return low.astype(np.float32), high.astype(np.float32)
+
     def encode_position(self, position: ArrayLike) -> Array:
         """Positions (..., 3) in metres -> int32 (..., 3)."""
         xp = _namespace(position)
-        low, high = np.round(np.array(self.low) / self.step), np.round(np.array(self.high) / self.step)
         steps = xp.round(xp.asarray(position, np.float32) / self.step)
-        return xp.clip(steps, low.astype(np.float32), high.astype(np.float32)).astype(np.int32)
+        return xp.clip(steps, *self._ends).astype(np.int32)
 
     def encode(self, action: Action | ArrayLike, gripper_open: ArrayLike | None = None) -> Array:
         """An Action, or poses (..., 7) with gripper_open (...,), -> int32 (..., 8): x y z qx qy qz qw gripper.

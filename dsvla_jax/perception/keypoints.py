@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import cv2
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from dsvla_jax.errors import UserError
@@ -37,6 +37,9 @@ class Sighting:
     problem: str = ""
     point: np.ndarray | None = None
     pixel: tuple[int, int] | None = None
+
+
+_to_world = jax.jit(unproject_pixels)
 
 
 class KeypointsNotFound(UserError):
@@ -69,8 +72,7 @@ def locate(sighting: Sighting, depth: np.ndarray, camera: Camera) -> Sighting:
     rows, columns = (slice(max(0, at - MARGIN), at + MARGIN + 1) for at in (v, u))
     around = depth[rows, columns][sighting.mask[rows, columns]]
     distance = np.median(around[np.isfinite(around) & (around > 0)])
-    pixel_and_depth = (jnp.float32(u), jnp.float32(v), jnp.float32(distance))
-    point = np.asarray(unproject_pixels(*pixel_and_depth, camera))
+    point = np.asarray(_to_world(np.float32(u), np.float32(v), np.float32(distance), camera))
     return dataclasses.replace(sighting, point=point, pixel=pixel)
 
 

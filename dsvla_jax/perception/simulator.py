@@ -64,12 +64,14 @@ class SegmentationKeypoints:
             self._masks = object_masks(self._environment, state, seen)
             self._rgb, self._depth = np.asarray(seen.rgb), np.asarray(seen.depth)
         rgb, depth = self._rgb, self._depth
+        # Taking an episode's out of a device's arrays costs a program for each.
+        cameras = jax.tree.map(np.asarray, state.camera)
         most = max(len(arm) for arm in self._arms[0])
         points = np.zeros((len(rgb), self._environment.num_arms, most, 3), np.float32)
         problems = [""] * len(rgb)
         for i, (tracker, arms) in enumerate(zip(self._trackers, self._arms, strict=True)):
             try:
-                camera = jax.tree.map(lambda x, i=i: x[i], state.camera)
+                camera = jax.tree.map(lambda x, i=i: x[i], cameras)
                 points[i] = tracker.keypoints(rgb[i], depth[i], camera, arms)
             except KeypointsNotFound as problem:
                 problems[i] = str(problem)
