@@ -32,7 +32,7 @@ train: setup  ## demonstrations, training, closed-loop evaluation and report for
 	@echo "report: $(RUN)/eval/report.html"
 
 test: setup  ## the test suite, on up to four cores
-	$(PY) -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+	$(PY) -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 test-slow: setup  ## the long tests too
 	$(PY) -m pytest -m "slow or not slow"
