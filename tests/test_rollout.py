@@ -154,10 +154,8 @@ def test_each_failure_has_its_reason():
     assert reasons(task, wrong) == ["took the wrong object"] * EPISODES
 
 
-@pytest.mark.parametrize(
-    ("task", "shifts"),
-    [("lamp_on", ()), pytest.param("bimanual_lift_ball", ("instance",), marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "shifts"), [("lamp_on", ()), ("bimanual_lift_ball", ("instance",))])
 def test_episodes_end_alike_in_mjx(task, shifts):
     """One arm and two; the balls of other sizes besides, which each stepper gives to its own models."""
     ends = {}
