@@ -56,7 +56,7 @@ def test_a_program_ends_with_one_message(arguments: list[str], expected: str, tm
         (["train.py", "tiny", "--steps", "many"], "many"),
         (["train.py", "tiny", "--data.tasks", "lamp_of"], "lamp_on"),
         (["train.py", "tiny", "--data.crop", "1.5"], "error: data.crop: expected more than 0, at most 1, got 1.5"),
-        (["train.py", "tiny_oxe", "--oxe.horizon", "-1"], "error: oxe.horizon: expected at least 0, at most 3600, got -1.0"),
+        (["train.py", "tiny_oxe", "--oxe.horizon", "-1"], "oxe.horizon: expected at least 0, at most 3600, got -1.0"),
         (["eval.py", "nowhere", "--compare", "elsewhere"], "no results under these conditions; evaluate first"),
         (["train.py", "tiny", "--run", "runs/lr=[0.1]"], "whose path contains [; choose another folder"),
         (["train.py", "tiny", "--run", "/dev/null/run"], "error: /dev/null/run: Not a directory; choose another path"),

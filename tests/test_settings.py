@@ -82,6 +82,7 @@ def test_no_size_or_rate_is_zero_negative_or_not_a_number(toy: Experiment, value
         ("model.language.vocab_size", 40, "model.language.vocab_size is 40; they must be of one language model"),
         ("optimizer.warmup_steps", 60, r"optimizer.warmup_steps: expected at most steps \(2\), got 60"),
         ("base", "nowhere", "nowhere: no run here"),
+        ("model.language.explicit_head_dim", 10**6, "expected at least 1, at most 8192, got 1000000"),
         ("model.attention", "cudnn", "model.dtype: expected bfloat16 with attention 'cudnn', got float32"),
         ("data.source", "simulator", "tokenizer: it lacks"),
         ("evaluate_every", 2, r"tokenizer: it lacks .*, which the simulator gives; .*--evaluate-every 0\)"),

@@ -154,7 +154,7 @@ class LanguageConfig:
             ffn=COUNT,
             rope_theta=ROPE_THETA,
             norm_eps=EPSILON,
-            explicit_head_dim=COUNT,
+            explicit_head_dim=at_least(1, at_most=8192),
         )
         # A rotation turns pairs of numbers.
         if self.explicit_head_dim is None:
