@@ -21,8 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import eval as evaluation
-from data_pipelines.episodes import EpisodeReader
-from data_pipelines.records import decode_frame
+from data_pipelines.records import Episode, decode_frame
 from data_pipelines.sources import open_held_out
 from dsvla_jax.command_line import configure_jax, fail_with_message
 from dsvla_jax.evaluation.withheld import Part, withholding
@@ -80,10 +79,8 @@ class KeyframeErrors:
     varies_degrees: float
 
 
-def held_out_errors(policy: Policy, reader: EpisodeReader, task: str) -> list[KeyframeErrors]:
-    """Compares answers to every recorded frame with the demonstrator's next keyframe."""
-    episodes = [reader.episode(number) for number in range(len(reader))]
-    episodes = [episode for episode in episodes if episode.task == task]
+def held_out_errors(policy: Policy, task: str, episodes: Sequence[Episode]) -> list[KeyframeErrors]:
+    """Compares answers to every recorded frame of a task's episodes with the demonstrator's next keyframe."""
     found = []
     for keyframe in range(max(episode.num_frames for episode in episodes)):
         frames = [decode_frame(episode, keyframe) for episode in episodes if episode.num_frames > keyframe]
@@ -130,7 +127,10 @@ def main(options: Options) -> int:
     policy = load_policy(options.run)
     data = dataclasses.replace(experiment.data, tasks=tasks)
     reader = open_held_out(data, policy.tokenizer, options.held_out)
-    errors = [one for task in tasks for one in held_out_errors(policy, reader, task)]
+    episodes = [reader.episode(number) for number in range(len(reader))]
+    errors = []
+    for task in tasks:
+        errors += held_out_errors(policy, task, [episode for episode in episodes if episode.task == task])
     table = Table("task", "keyframe", *map(name_of, VIEWS), title="median error: position cm; rotation degrees")
     for task, keyframe in dict.fromkeys((one.task, one.keyframe) for one in errors):
         row = [one for one in errors if (one.task, one.keyframe) == (task, keyframe)]

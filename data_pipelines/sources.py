@@ -110,7 +110,7 @@ def require_tasks_fit(
 ) -> None:
     """Raises UserError where an instruction of a simulated task has unknown words, or is too long.
 
-    instructions_only: as in `require_data_fits`. or_else: what else would mend it.
+    instructions_only: as in `require_data_fits`. or_else: the end of the message, another fix.
     """
     texts = [(text, task.num_arms) for task in tasks for text in task.all_instructions()]
     if unknown := unknown_words([text for text, _ in texts], tokenizer):

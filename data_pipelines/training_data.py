@@ -24,7 +24,7 @@ from dsvla_jax.encoding.displacement import DisplacementScale
 from dsvla_jax.encoding.text import Tokenizer
 from dsvla_jax.encoding.vector_scale import VectorScale, fit_vector_scale
 from dsvla_jax.experiment import Experiment, load_experiment
-from dsvla_jax.policies.pose_vectors import VECTOR, to_vectors
+from dsvla_jax.policies.pose_vectors import to_vectors
 from dsvla_jax.training.distributed import first_process_first
 from dsvla_jax.training.loop import Batches
 from dsvla_jax.training.sharding import BatchPart
@@ -118,13 +118,15 @@ def fit_to_demonstrations(
     """The range of the vectors of keyframes that follow, over frames of all episodes, varied as in training."""
     rng = np.random.default_rng(0)
     numbers = np.linspace(0, reader.num_frames - 1, min(reader.num_frames, SCALE_FRAMES)).astype(int)
-    vectors = []
+    poses, grippers, origins = [], [], []
     for number in numbers:
         one = sample(reader.frame(int(number)), rng)
-        origin = jnp.asarray(one.inputs.robot.pose[..., :3])
-        found = to_vectors(jnp.asarray(one.pose), jnp.asarray(one.gripper_open), origin, codec)
-        vectors.append(np.asarray(found)[:, one.inputs.arms].reshape(-1, VECTOR))
-    return fit_vector_scale(np.concatenate(vectors))
+        there = one.inputs.arms
+        poses.append(one.pose[:, there].reshape(-1, 7))
+        grippers.append(one.gripper_open[:, there].reshape(-1))
+        origins.append(np.tile(one.inputs.robot.pose[there, :3], (len(one.pose), 1)))
+    pose, gripper_open, origin = (jnp.asarray(np.concatenate(rows)) for rows in (poses, grippers, origins))
+    return fit_vector_scale(np.asarray(to_vectors(pose, gripper_open, origin, codec)))
 
 
 def open_validation_data(

@@ -21,7 +21,6 @@ from configs import get_config
 from dsvla_jax.evaluation.device_loop import DeviceLoop
 from dsvla_jax.experiment import Experiment, load_experiment
 from dsvla_jax.model.vla import initialize
-from dsvla_jax.policies.config import PolicyConfig
 from dsvla_jax.policies.interface import Policy
 from dsvla_jax.policies.three_ds_vla import TextPolicy
 from dsvla_jax.sim.environment import Environment
@@ -52,8 +51,8 @@ def policy_to_run(job: Job) -> tuple[Policy, Experiment, bool]:
     if (run / "metrics.jsonl").exists():
         return dsvla_jax.policy.load_policy(run), load_experiment(run / "config.json"), True
     experiment = get_config("tiny")
-    config = PolicyConfig(experiment.encoding, experiment.model)
-    return TextPolicy(config, initialize(experiment.model, jax.random.key(0)), suite_tokenizer()), experiment, False
+    variables = initialize(experiment.model, jax.random.key(0))
+    return TextPolicy(experiment.policy, variables, suite_tokenizer()), experiment, False
 
 
 def starts(task: str, image_size: int, split: str, count: int) -> SimState:
