@@ -57,8 +57,11 @@ class MeshConfig:
 
 @dataclasses.dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW with linear warm-up and a cosine to `final_fraction` of the peak."""
+    """AdamW or Muon, with linear warm-up and a cosine to `final_fraction` of the peak."""
 
+    method: Literal["adamw", "muon"] = "adamw"
+    """How gradients become updates. muon: the update of every matrix of a layer is made orthogonal (Jordan 2024), and
+    as large as AdamW's (Liu et al. 2025, arXiv 2502.16982); all else is updated by AdamW with Nesterov's momentum."""
     learning_rate: float = 1e-3
     """Peak learning rate."""
     warmup_steps: int = 50

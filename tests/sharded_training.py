@@ -13,7 +13,7 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -146,6 +146,7 @@ class Options:
     process: int = 0
     processes: int = 1
     fusion: str = "prefix"
+    method: Literal["adamw", "muon"] = "adamw"
     points: bool = False
     run: Path | None = None
     until: int = 20
@@ -158,6 +159,10 @@ def main(options: Options) -> None:
     for mesh, devices, parts in zip(options.meshes, options.devices, options.accumulation, strict=True):
         config = MeshConfig(*map(int, mesh.split(",")))
         experiment = tiny_experiment(options.fusion, options.points, mesh=config, gradient_accumulation=parts)
+        if options.method == "muon":
+            # All parameters learn: adapters alone have few matrices.
+            optimizer = dataclasses.replace(experiment.optimizer, method="muon")
+            experiment = dataclasses.replace(experiment, optimizer=optimizer, regime="full")
         print(
             "losses", json.dumps(train(experiment, devices, options.run, options.until, options.validate)), flush=True
         )

@@ -127,6 +127,14 @@ def test_losses_are_the_same_on_any_mesh(fusion):
 
 
 @pytest.mark.slow
+def test_losses_with_muon_are_the_same_on_any_mesh():
+    runs = {"one": ("1,1,1", 1, 1), "fsdp": ("1,8,1", 0, 1), "2 x 2 x 2": ("2,2,2", 0, 1)}
+    curves = curves_on(runs, "--method", "muon")
+    for curve in curves.values():
+        require_learning_alike(curve, curves["one"])
+
+
+@pytest.mark.slow
 def test_a_checkpoint_of_eight_devices_goes_on_anywhere(one_device, tmp_path: Path):
     run = ("--run", str(tmp_path))
     whole = told(start(8, "--meshes", "2,2,2", "--devices", "0", "--accumulation", "1", *run, "--until", "10"))

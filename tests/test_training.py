@@ -1,11 +1,14 @@
 """The objective, the two regimes and checkpoints, on models small enough to train in a second."""
 
 import dataclasses
+import math
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from dsvla_jax.encoding.encode import encode_text
@@ -83,9 +86,43 @@ def test_lora_regime_changes_adapters_and_projection_and_nothing_else(fusion):
     assert losses[-1] < losses[0]
 
 
-def test_full_regime_fits_a_batch():
-    _, _, _, losses = train(dataclasses.replace(small_experiment(), steps=60), 60)
+@pytest.mark.parametrize("method", ["adamw", "muon"])
+def test_full_regime_fits_a_batch(method):
+    optimizer = OptimizerConfig(method=method)
+    _, _, _, losses = train(dataclasses.replace(small_experiment(optimizer=optimizer), steps=60), 60)
     assert losses[-1] < 0.5 * losses[0]
+
+
+def test_muon_turns_a_layers_update_and_leaves_its_size():
+    """By the singular values of each matrix, stacked ones each by itself. What is no matrix is left to AdamW."""
+    rng = np.random.default_rng(0)
+    tree = {
+        "layers": {"up": {"kernel": rng.normal(size=(2, 48, 32))}},
+        "linear": {"kernel": rng.normal(size=(24, 40)), "bias": rng.normal(size=40)},
+        "patch_kernel": rng.normal(size=(4, 4, 3, 8)),
+    }
+    weights, gradient = jax.tree.map(jnp.zeros_like, tree), jax.tree.map(jnp.asarray, tree)
+
+    config = OptimizerConfig(method="muon", learning_rate=1e-2, warmup_steps=0, gradient_clip=math.inf)
+
+    def update(optimizer: optax.GradientTransformation) -> dict[str, Any]:
+        changes, _ = jax.jit(optimizer.update)(gradient, optimizer.init(weights), weights)
+        return jax.tree.map(lambda leaf: np.asarray(leaf) / 1e-2, changes)
+
+    muon = update(make_optimizer(config, 10))
+    adamw = update(optax.adamw(1e-2, config.beta1, config.beta2, weight_decay=0.0, nesterov=True))
+    for change, of in (
+        *zip(muon["layers"]["up"]["kernel"], tree["layers"]["up"]["kernel"], strict=True),
+        (muon["linear"]["kernel"], tree["linear"]["kernel"]),
+    ):
+        left, _, right = np.linalg.svd(of, full_matrices=False)
+        turned = -(left.T @ change @ right.T)
+        singular = np.diag(turned) / (0.2 * np.sqrt(max(of.shape)))
+        assert np.all((singular > 0.6) & (singular < 1.3)), "all directions are equally large, up to Newton and Schulz"
+        assert np.abs(turned - np.diag(np.diag(turned))).max() < 0.02
+        assert 0.15 < np.sqrt(np.mean(change**2)) < 0.25
+    np.testing.assert_allclose(muon["linear"]["bias"], adamw["linear"]["bias"], rtol=1e-6)
+    np.testing.assert_allclose(muon["patch_kernel"], adamw["patch_kernel"], rtol=1e-6)
 
 
 @pytest.mark.parametrize("steps", [1, 2])
