@@ -28,7 +28,7 @@ from dsvla_jax.evaluation.results import (
     success_rates,
     write_results,
 )
-from dsvla_jax.evaluation.statistics import wilson_interval
+from dsvla_jax.evaluation.statistics import Pairs, paired_interval, wilson_interval
 from dsvla_jax.geometry.cameras import front_camera, project
 
 
@@ -175,6 +175,10 @@ def test_runs_are_compared_on_the_tasks_that_all_have():
     assert re.search(r"lamp_on\D+75\.0 \(30 to 95\)\D+100\.0 \(51 to 100\)", text)
     assert re.search(r"lift_ball\D+0\.0 \(0 to 79\)\D+-", text)
     assert re.search(r"mean of the task that all have\D+75\.0\D+100\.0", text)
+    # Of four episodes that both have, three are alike; the one of the other task has no pair.
+    low, high = paired_interval(Pairs(both=3, first=1, second=0, neither=0))
+    assert f"+25.0 ({100 * low:+.0f} to {100 * high:+.0f})" in text
+    assert re.search(r"exact test\)\W+1 ", text)
 
 
 @pytest.mark.parametrize("width", [60, 100])

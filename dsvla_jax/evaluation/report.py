@@ -16,9 +16,11 @@ from dsvla_jax.evaluation.results import (
     checkpoints_of,
     compare_physics,
     macro_mean,
+    paired,
     pooled,
     success_rates,
 )
+from dsvla_jax.evaluation.statistics import Pairs, paired_interval, sign_test
 
 
 def print_table(results: Sequence[EpisodeResult], console: Console | None = None) -> None:
@@ -39,7 +41,10 @@ def print_table(results: Sequence[EpisodeResult], console: Console | None = None
 
 
 def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Console | None = None) -> None:
-    """Success rates of several runs side by side, a row a task that any of them has; results by the run's name."""
+    """Success rates of several runs side by side, a row a task that any of them has; results by the run's name.
+
+    The last rows compare every other run with the first one in the episodes that both have.
+    """
     rates = {name: {rate.name: rate for rate in success_rates(results)} for name, results in sets.items()}
     table = Table(title="closed-loop success, % (95 % interval)")
     table.add_column("task", overflow="fold")
@@ -55,6 +60,10 @@ def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Conso
     means = [100 * macro_mean([rate for task, rate in of_run.items() if task in common]) for of_run in rates.values()]
     tasks = "task" if len(common) == 1 else f"{len(common)} tasks"
     table.add_row(f"mean of the {tasks} that all have", *(f"{mean:.1f}" for mean in means))
+    first, *others = sets.values()
+    pairs = [paired(results, first) for results in others]
+    table.add_row("less the first one's, in the same episodes", "", *map(_difference_cell, pairs))
+    table.add_row("p of no difference (McNemar's exact test)", "", *(f"{sign_test(one):.2g}" for one in pairs))
     (console or Console()).print(table)
 
 
@@ -63,6 +72,11 @@ def _rate_cell(rate: SuccessRate | None) -> str:
         return "-"
     low, high = rate.interval
     return f"{100 * rate.rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _difference_cell(pairs: Pairs) -> str:
+    low, high = paired_interval(pairs)
+    return f"{100 * pairs.difference:+.1f} ({100 * low:+.0f} to {100 * high:+.0f})" if pairs.trials else "-"
 
 
 def _cells(rate: SuccessRate) -> tuple[str, str, str, str]:

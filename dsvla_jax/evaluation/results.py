@@ -10,7 +10,7 @@ import numpy as np
 
 from dsvla_jax.errors import UserError
 from dsvla_jax.evaluation.conditions import Conditions, conditions_from_json
-from dsvla_jax.evaluation.statistics import wilson_interval
+from dsvla_jax.evaluation.statistics import Pairs, count_pairs, wilson_interval
 from dsvla_jax.files import replacing
 
 FILE = "results.jsonl"
@@ -142,6 +142,13 @@ def success_rates(results: Sequence[EpisodeResult]) -> list[SuccessRate]:
 def macro_mean(rates: Sequence[SuccessRate]) -> float:
     """The mean of the tasks' rates: every task counts the same, however many episodes it had."""
     return float(np.mean([rate.rate for rate in rates])) if rates else float("nan")
+
+
+def paired(first: Sequence[EpisodeResult], second: Sequence[EpisodeResult]) -> Pairs:
+    """How two runs fared in the episodes that both have: those of one task and number start alike."""
+    one, other = ({(result.task, result.episode): result.success for result in results} for results in (first, second))
+    both = [episode for episode in one if episode in other]
+    return count_pairs([one[episode] for episode in both], [other[episode] for episode in both])
 
 
 def pooled(rates: Sequence[SuccessRate]) -> SuccessRate:
