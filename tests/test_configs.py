@@ -112,6 +112,18 @@ def test_row_is_what_the_table_says(name: str, row: tuple[bool, bool, bool]):
     assert in_order != (points and aligned)
 
 
+def test_without_images_all_pictures_are_alike():
+    experiment = get_config("tiny")
+    example = jax.tree.map(jnp.asarray, batch_of(experiment))
+
+    def images(use_images: bool) -> np.ndarray:
+        encoding = replace(experiment.encoding, use_images=use_images)
+        return np.asarray(model_inputs(example.pictures, example.text, encoding).images)
+
+    assert np.ptp(images(True), axis=0).max() > 1
+    assert np.ptp(images(False)) == 0
+
+
 def test_every_config_loads_and_a_typo_names_the_nearest():
     for name in config_names():
         assert isinstance(get_config(name), Experiment)

@@ -41,6 +41,8 @@ class EncodingConfig:
     """State the active keypoint of each arm in the prompt (paper, section 3.3); false is the ablation."""
     use_points: bool = True
     """Give the vision encoder 3D tokens (paper, section 3.2); false is the ablation."""
+    use_images: bool = True
+    """Give the vision encoder pictures; false is the control, to which all pictures are alike."""
 
     def __post_init__(self) -> None:
         check_fields(

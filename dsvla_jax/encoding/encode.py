@@ -29,6 +29,8 @@ def model_inputs(pictures: Picture[Array], text: Text[Array], config: EncodingCo
     """
     batch, cameras = pictures.rgb.shape[:2]
     images = normalize_image(pictures.rgb.reshape(-1, *pictures.rgb.shape[2:]), config.image_size)
+    if not config.use_images:
+        images = jnp.zeros_like(images)
     if config.use_points:
         tokens, _, patches = cloud_tokens(pictures, config)
     else:
