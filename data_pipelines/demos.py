@@ -35,11 +35,15 @@ from dsvla_jax.sim.cameras import FRONT, check_cameras
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.physics import SimState
 from dsvla_jax.sim.seeds import episode_keys
+from dsvla_jax.sim.shifts import check_shifts
 from dsvla_jax.sim.tasks import get_task, select_tasks
 from dsvla_jax.types import Action, Observation
 
 # Attempts, as a multiple of the episodes asked for, after which an expert counts as broken.
 MAX_ATTEMPTS = 10
+
+# What an index does not say of the settings.
+USUAL: dict[str, Json] = {"cameras": [FRONT], "shift": []}
 
 # (first number, count) -> an episode for each number of the seed stream, None for a failure.
 Demonstrate = Callable[[int, int], Sequence[Episode | None]]
@@ -66,17 +70,21 @@ class Settings:
     keypoints: Literal["segmentation", "oracle"] = "segmentation"
     """Those found in the first picture by the simulator's masks and the depth on them, or the task's own points. An
     attempt in which an object is not seen is replaced like one that failed."""
+    shift: tuple[str, ...] = ()
+    """Conditions unlike the usual ones (paper, Table 4): instance, position, background, camera."""
     batch: int = 20
     """Episodes simulated at a time, and attempts a shard."""
 
     def __post_init__(self) -> None:
         check_fields(self, "", **self._ranges())
+        check_shifts(self.shift)
 
     def as_written(self) -> dict[str, Json]:
-        """The settings that an index keeps. That a folder has the front camera alone is not written."""
+        """The settings that an index keeps: what is usual, and was the only way once, is not written."""
         written = dataclasses.asdict(self)
-        if self.cameras == (FRONT,):
-            del written["cameras"]
+        for name, usual in USUAL.items():
+            if list(written[name]) == usual:
+                del written[name]
         return written
 
     def _ranges(self) -> dict[str, Range]:
@@ -113,7 +121,11 @@ class ScriptedExpert:
         self.task = get_task(task)
         self.settings = settings
         self.environment = Environment(
-            self.task, physics="mujoco", image_size=settings.image_size, cameras=settings.cameras
+            self.task,
+            physics="mujoco",
+            image_size=settings.image_size,
+            cameras=settings.cameras,
+            shifts=settings.shift,
         )
         self._replay_latch = jax.jit(jax.vmap(replay_latch))
 
@@ -218,8 +230,8 @@ def generate_demonstrations(
     folder = Path(folder)
 
     def shards() -> dict[str, ShardEntry]:
-        made_with = {**dataclasses.asdict(wanted), "cameras": list(wanted.cameras)}
-        return {entry["file"]: entry for entry in existing_shards(folder, made_with, assumed={"cameras": [FRONT]})}
+        made_with = {**dataclasses.asdict(wanted), **{name: list(getattr(wanted, name)) for name in USUAL}}
+        return {entry["file"]: entry for entry in existing_shards(folder, made_with, assumed=USUAL)}
 
     entries = shards()
     with contextlib.ExitStack() as stack:

@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dsvla_jax.errors import UserError
+from data_pipelines.demos import ScriptedExpert, Settings, generate_demonstrations
+from data_pipelines.episodes import EpisodeReader
+from data_pipelines.records import decode_frame
+from dsvla_jax.errors import DataError, UserError
 from dsvla_jax.geometry.cameras import project
 from dsvla_jax.sim.environment import Environment
 from dsvla_jax.sim.seeds import episode_keys
@@ -81,3 +84,27 @@ def test_clutter_stands_on_the_table_in_view():
 def test_an_unknown_shift_is_named():
     with pytest.raises(UserError, match="unknown shift 'colour': expected some of instance, position"):
         Environment(TASK, shifts=("colour",))
+
+
+def test_demonstrations_under_other_conditions_say_so(tmp_path):
+    """Every episode has a camera of its own, and the folder is not continued without the shift."""
+    options = {"image_size": 24, "batch": 2, "perturb": 0.0, "keypoints": "oracle"}
+    shifted = Settings(**options, shift=("camera",))
+    expert = ScriptedExpert("lamp_on", shifted)
+    generate_demonstrations(
+        tmp_path, ["lamp_on"], 2, demonstrator=lambda *_: expert, progress=False, **options, shift=("camera",)
+    )
+    reader = EpisodeReader(tmp_path)
+    seen = expert.environment.observe(expert.environment.reset(episode_keys(0, "train", "lamp_on", 0, 2)))
+    for number in range(2):
+        frame = decode_frame(reader.episode(number), 0)
+        np.testing.assert_array_equal(frame.pictures.rgb, seen.pictures.rgb[number])
+        np.testing.assert_array_equal(
+            frame.pictures.camera.world_from_camera, seen.pictures.camera.world_from_camera[number]
+        )
+    one, other = (reader.episode(number).world_from_camera[0] for number in range(2))
+    assert np.abs(one - other).max() > 0.01
+    with pytest.raises(DataError, match=r"settings.shift: expected \[\] as asked for, got \['camera'\]"):
+        generate_demonstrations(tmp_path, ["lamp_on"], 2, demonstrator=lambda *_: expert, progress=False, **options)
+    with pytest.raises(UserError, match="unknown shift 'weather'"):
+        Settings(shift=("weather",))
