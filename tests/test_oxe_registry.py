@@ -171,13 +171,13 @@ def test_fixtures_whose_writing_was_interrupted_are_written_again(tmp_path, monk
 
 
 def test_every_dataset_tells_a_hand_or_says_why_not():
-    assert len(DATASETS) == 75 == len(FIXTURES)
+    assert len(DATASETS) == 77 == len(FIXTURES)
     assert {name for name, dataset in DATASETS.items() if dataset.encoding == "joints"} == JOINTS
     assert {name for name, dataset in DATASETS.items() if dataset.encoding == "navigation"} == NAVIGATION
     assert {name: dataset.bgr for name, dataset in DATASETS.items() if dataset.bgr} == EXCHANGED
     for name, dataset in DATASETS.items():
         assert dataset.has_pose or dataset.encoding == "joints" or all(arm.action for arm in dataset.arms), name
-        assert dataset.source.startswith(("gs://", "https://"))
+        assert dataset.source.startswith(("gs://", "https://", "python -m data_pipelines.rlds.export")), name
 
 
 @pytest.mark.parametrize(("mixture", "size"), [("rtx", 10), ("oxe_magic_soup", 23), ("oxe_magic_soup_plus", 27),

@@ -51,7 +51,8 @@ class ArmColumns:
     """Where one arm's motion stands in an episode.
 
     pose: (T, 7). action: (T, 6). gripper: (T,), commanded openness. gripper_state: (T,), measured openness.
-    joints: (T, J).
+    joints: (T, J). keyframe: (T, 7), where the action is the next keyframe: with `gripper` it is the target, and
+    no frame ahead is looked for.
     """
 
     gripper: Column
@@ -59,6 +60,7 @@ class ArmColumns:
     action: Column | None = None
     gripper_state: Column | None = None
     joints: Column | None = None
+    keyframe: Column | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,15 +116,16 @@ class OxeDataset:
         state = _columns(episode, [arm.gripper_state for arm in self.arms], "gripper state")
         # Where it is not measured, the gripper is where the last command sent it.
         state = np.concatenate([command[:1], command[:-1]]) if state is None else state
-        pose, action, joints = (
+        pose, action, joints, keyframe = (
             None if values is None else values[steps]
             for values in (
                 _columns(episode, [arm.pose for arm in self.arms], "pose"),
                 _columns(episode, [arm.action for arm in self.arms], "action"),
                 _columns(episode, [arm.joints for arm in self.arms], "joints"),
+                _columns(episode, [arm.keyframe for arm in self.arms], "keyframe"),
             )
         )
-        return Motion(self._instruction(episode), pose, state[steps], action, command[steps], joints)
+        return Motion(self._instruction(episode), pose, state[steps], action, command[steps], joints, keyframe)
 
     def _instruction(self, episode: RldsEpisode) -> str:
         """Of the first step, without the space around it; nothing where it has no words."""

@@ -46,7 +46,7 @@ def why_unsupported(dataset: OxeDataset, config: OxeConfig) -> str | None:
 
 
 def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targets:
-    """The targets of an episode of T steps: one for every step but the last.
+    """The targets of an episode of T steps: one for every step but the last, or where actions are keyframes for each.
 
     With a horizon, the target of step t is step t + horizon, or the last one; with keyframes, the next keyframe. Its
     displacement is that between reached poses if the dataset records poses, else the composition of the commands in
@@ -56,6 +56,16 @@ def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targ
     if reason := why_unsupported(dataset, config):
         raise UserError(f"{dataset.name}: cannot give {config.target} targets: {reason}; leave it out of the mixture")
     steps = motion.num_steps
+    if motion.keyframe is not None and motion.pose is not None:
+        relative = config.target == "relative"
+        return Targets(
+            frame=np.arange(steps),
+            pose=motion.pose,
+            gripper_open=motion.gripper_open,
+            target_pose=None if relative else motion.keyframe,
+            displacement=displacement(motion.pose, motion.keyframe).astype(np.float32) if relative else None,
+            target_gripper=motion.gripper_command,
+        )
     frame = np.arange(max(steps - 1, 0))
     if config.horizon > 0:
         ahead = max(1, round(config.horizon * dataset.hz / dataset.stride))
