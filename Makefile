@@ -14,7 +14,7 @@ EVAL_OPTIONS ?=
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
 
-# Compiled here, the packages start a program three times as fast where Python is told to write no bytecode.
+# Compiling at installation makes programs start faster if PYTHONDONTWRITEBYTECODE is set, as in many containers.
 $(VENV)/.synced: requirements.lock pyproject.toml
 	@test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	@test -x $(VENV)/bin/uv || $(PY) -m pip install --quiet --disable-pip-version-check uv

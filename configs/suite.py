@@ -1,4 +1,4 @@
-"""All 26 tasks, one policy for one and two arms: about 45 minutes of training on two processor cores."""
+"""One policy for all 26 tasks, single-arm and dual-arm. Trains for about 45 minutes on two processor cores."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ PATCH = 16
 
 def config() -> Experiment:
     plain = tiny()
-    # Wavelengths that tell places apart at this width, and twice the 3D tokens.
+    # At this width the paper's wavelengths cannot resolve a token's position; these can. Twice as many 3D tokens.
     points = dataclasses.replace(plain.encoding.points, alpha=10.0, beta=12.0, group_sizes=(128, 64, 32))
     encoding = dataclasses.replace(plain.encoding, patch_size=PATCH, points=points)
     vision = dataclasses.replace(plain.model.vision, patch_size=PATCH)
@@ -18,7 +18,7 @@ def config() -> Experiment:
         plain,
         encoding=encoding,
         model=dataclasses.replace(plain.model, vision=vision),
-        # A policy that is not told where the camera is can place what it sees only where the world does not move.
+        # Shifting the world without telling the vision tower the camera's pose hides absolute positions from it.
         data=dataclasses.replace(plain.data, tasks=("all",), folder="data/suite", shift_world=0.0),
         optimizer=OptimizerConfig(method="muon", learning_rate=2e-3, average_decay=0.998),
         steps=4800,

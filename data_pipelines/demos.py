@@ -42,8 +42,8 @@ from dsvla_jax.types import Action, Observation
 # Attempts, as a multiple of the episodes asked for, after which an expert counts as broken.
 MAX_ATTEMPTS = 10
 
-# What an index does not say of the settings.
-USUAL: dict[str, Json] = {"cameras": [FRONT], "shift": []}
+# Settings that older folders did not record; an index omits them when they have these values.
+UNRECORDED: dict[str, Json] = {"cameras": [FRONT], "shift": []}
 
 # (first number, count) -> an episode for each number of the seed stream, None for a failure.
 Demonstrate = Callable[[int, int], Sequence[Episode | None]]
@@ -71,7 +71,7 @@ class Settings:
     """Those found in the first picture by the simulator's masks and the depth on them, or the task's own points. An
     attempt in which an object is not seen is replaced like one that failed."""
     shift: tuple[str, ...] = ()
-    """Conditions unlike the usual ones (paper, Table 4): instance, position, background, camera."""
+    """Ways in which scenes differ from the default ones (paper, Table 4): instance, position, background, camera."""
     batch: int = 20
     """Episodes simulated at a time, and attempts a shard."""
 
@@ -79,13 +79,17 @@ class Settings:
         check_fields(self, "", **self._ranges())
         check_shifts(self.shift)
 
+    def as_json(self) -> dict[str, Json]:
+        """Returns all settings, tuples as lists."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
+        }
+
     def as_written(self) -> dict[str, Json]:
-        """The settings that an index keeps: what is usual, and was the only way once, is not written."""
-        written = dataclasses.asdict(self)
-        for name, usual in USUAL.items():
-            if list(written[name]) == usual:
-                del written[name]
-        return written
+        """Returns the settings that an index records, see `UNRECORDED`."""
+        return {
+            name: value for name, value in self.as_json().items() if name not in UNRECORDED or value != UNRECORDED[name]
+        }
 
     def _ranges(self) -> dict[str, Range]:
         return {
@@ -230,8 +234,8 @@ def generate_demonstrations(
     folder = Path(folder)
 
     def shards() -> dict[str, ShardEntry]:
-        made_with = {**dataclasses.asdict(wanted), **{name: list(getattr(wanted, name)) for name in USUAL}}
-        return {entry["file"]: entry for entry in existing_shards(folder, made_with, assumed=USUAL)}
+        found = existing_shards(folder, wanted.as_json(), assumed=UNRECORDED)
+        return {entry["file"]: entry for entry in found}
 
     entries = shards()
     with contextlib.ExitStack() as stack:

@@ -60,8 +60,8 @@ class OptimizerConfig:
     """AdamW or Muon, with linear warm-up and a cosine to `final_fraction` of the peak."""
 
     method: Literal["adamw", "muon"] = "adamw"
-    """How gradients become updates. muon: the update of every matrix of a layer is made orthogonal (Jordan 2024), and
-    as large as AdamW's (Liu et al. 2025, arXiv 2502.16982); all else is updated by AdamW with Nesterov's momentum."""
+    """The optimizer. muon orthogonalises the update of each layer's matrices (Jordan 2024) and scales it to AdamW's
+    (Liu et al. 2025, arXiv 2502.16982); all other parameters use AdamW with Nesterov momentum."""
     learning_rate: float = 1e-3
     """Peak learning rate."""
     warmup_steps: int = 50

@@ -51,8 +51,8 @@ class ArmColumns:
     """Where one arm's motion stands in an episode.
 
     pose: (T, 7). action: (T, 6). gripper: (T,), commanded openness. gripper_state: (T,), measured openness.
-    joints: (T, J). keyframe: (T, 7), where the action is the next keyframe: with `gripper` it is the target, and
-    no frame ahead is looked for.
+    joints: (T, J). keyframe: (T, 7), for datasets whose action is the next keyframe. It is then the target, with
+    `gripper`, whatever the horizon.
     """
 
     gripper: Column

@@ -15,8 +15,8 @@ class Motion:
     instruction: empty where the episode has none. pose: (T, A, 7), or None where the data do not tell it.
     gripper_open: (T, A), as measured, or else as last commanded.
     action: (T, A, 6), commanded displacement of each step, translation and rotation vector; or None.
-    gripper_command: (T, A). joints: (T, A, J) for datasets that tell joints only, else None. keyframe: (T, A, 7), the
-    pose that each step's action asks for, of datasets whose steps are keyframes, else None.
+    gripper_command: (T, A). joints: (T, A, J) for datasets that tell joints only, else None. keyframe: (T, A, 7), each
+    step's next keyframe, for datasets whose actions are keyframes, else None.
     """
 
     instruction: str

@@ -46,9 +46,10 @@ def why_unsupported(dataset: OxeDataset, config: OxeConfig) -> str | None:
 
 
 def make_targets(motion: Motion, dataset: OxeDataset, config: OxeConfig) -> Targets:
-    """The targets of an episode of T steps: one for every step but the last, or where actions are keyframes for each.
+    """Returns the targets of an episode of T steps: one for every step but the last.
 
-    With a horizon, the target of step t is step t + horizon, or the last one; with keyframes, the next keyframe. Its
+    If the dataset's actions are keyframes, every step has a target, its own action, whatever the horizon. Otherwise,
+    with a horizon, the target of step t is step t + horizon, or the last one; with keyframes, the next keyframe. Its
     displacement is that between reached poses if the dataset records poses, else the composition of the commands in
     between. The target's gripper is the command that holds there (of the last but one step at the end, where the last
     step's command was never carried out).

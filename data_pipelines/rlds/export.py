@@ -1,13 +1,12 @@
-"""Demonstrations as RLDS builds: python -m data_pipelines.rlds.export data/demos OUT
+"""Export demonstrations as RLDS builds: python -m data_pipelines.rlds.export data/demos OUT
 
-Writes OUT/keyframes_one_arm and OUT/keyframes_two_arms, of the episodes of robots with so many arms: pictures of one
-camera, states and keyframes, without depth and keypoints. They are read as any Open X-Embodiment dataset is
-(docs/data_oxe.md), and by TensorFlow Datasets.
+Writes single-arm episodes to OUT/keyframes_one_arm and dual-arm episodes to OUT/keyframes_two_arms: the pictures of one
+camera, robot states and keyframes, without depth or keypoints. They are read like any Open X-Embodiment dataset
+(docs/data_oxe.md).
 """
 
 import dataclasses
 import io
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +23,15 @@ from dsvla_jax.ranges import at_least, check_fields
 from dsvla_jax.sim.cameras import FRONT
 
 NAMES = {1: "keyframes_one_arm", 2: "keyframes_two_arms"}
-NUMBERS = 8
-"""Of an arm, in state and action: position, quaternion xyzw, 1 for an open gripper."""
 
 
-def features(arms: int, height: int, width: int) -> tfds_features.FeaturesDict:
-    """What a build of robots with so many arms holds."""
-    numbers = tfds_features.Tensor(shape=(NUMBERS * arms,), dtype=np.float32)
+def features(numbers_per_step: int, height: int, width: int) -> tfds_features.FeaturesDict:
+    """Returns the tfds features of a build.
+
+    numbers_per_step: the length of a state and of an action, which hold for each arm its position (metres), quaternion
+    (xyzw) and gripper (1 is open). height, width: of the pictures, pixels.
+    """
+    numbers = tfds_features.Tensor(shape=(numbers_per_step,), dtype=np.float32)
     flag, value = tfds_features.Scalar(dtype=np.bool_), tfds_features.Scalar(dtype=np.float32)
     picture = tfds_features.Image(shape=(height, width, 3), encoding_format="png")
     step = {
@@ -52,7 +53,7 @@ def features(arms: int, height: int, width: int) -> tfds_features.FeaturesDict:
 
 
 def rlds_episode(episode: Episode) -> dict[str, object]:
-    """One episode as `features` tells; the demonstrator succeeds with its last step."""
+    """Converts one episode to the structure that `features` describes. The reward is 1 at the last step, else 0."""
 
     def numbers(pose: np.ndarray, gripper_open: np.ndarray) -> np.ndarray:
         return np.concatenate([pose, gripper_open[..., None]], axis=-1).reshape(len(pose), -1).astype(np.float32)
@@ -81,39 +82,36 @@ class Options:
     """Options of the command line."""
 
     folder: tyro.conf.Positional[Path]
-    """The demonstrations."""
+    """The folder of demonstrations to export."""
     out: tyro.conf.Positional[Path]
-    """The folder of the builds; a build that is there already is refused."""
+    """The folder to write the builds to. An existing build is refused."""
     camera: str = FRONT
-    """The camera whose pictures are written."""
+    """The camera whose pictures are exported."""
     shards: int = 4
-    """Files of each build."""
+    """Number of files per build."""
 
     def __post_init__(self) -> None:
         check_fields(self, "", shards=at_least(1))
 
 
 def main(options: Options) -> None:
-    """Writes the builds."""
+    """Write the builds. Raises UserError if one exists."""
     reader = EpisodeReader(options.folder, cameras=(options.camera,))
     for name in NAMES.values():
         if (options.out / name).exists():
             raise UserError(f"{options.out / name}: there is a build already; delete it, or choose another folder")
 
-    def episodes(arms: int) -> Iterator[Episode]:
-        for number in tqdm(range(len(reader)), desc=NAMES[arms], unit="episode"):
-            episode = reader.episode(number)
-            if episode.num_arms == arms:
-                yield episode
-
-    for arms, name in NAMES.items():
-        chosen = list(episodes(arms))
-        if chosen:
-            height, width = decode_rgb(chosen[0].rgb_png[0]).shape[:2]
-            shards = min(options.shards, len(chosen))
-            written = [rlds_episode(episode) for episode in chosen]
-            build = write_build(options.out, name, features(arms, height, width), {"train": written}, shards)
-            print(f"{build}: {len(chosen)} episodes")
+    by_arms: dict[int, list[Episode]] = {arms: [] for arms in NAMES}
+    for number in tqdm(range(len(reader)), desc="reading", unit="episode"):
+        episode = reader.episode(number)
+        by_arms[episode.num_arms].append(episode)
+    for arms, episodes in by_arms.items():
+        if episodes:
+            height, width = decode_rgb(episodes[0].rgb_png[0]).shape[:2]
+            described = features((episodes[0].pose.shape[-1] + 1) * arms, height, width)
+            written = {"train": list(map(rlds_episode, episodes))}
+            build = write_build(options.out, NAMES[arms], described, written, min(options.shards, len(episodes)))
+            print(f"{build}: {len(episodes)} episodes")
 
 
 if __name__ == "__main__":

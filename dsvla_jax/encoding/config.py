@@ -42,7 +42,7 @@ class EncodingConfig:
     use_points: bool = True
     """Give the vision encoder 3D tokens (paper, section 3.2); false is the ablation."""
     use_images: bool = True
-    """Give the vision encoder pictures; false is the control, to which all pictures are alike."""
+    """Give the vision encoder the pictures; false is a blind control: every picture is replaced by the same one."""
 
     def __post_init__(self) -> None:
         check_fields(

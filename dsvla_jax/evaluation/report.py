@@ -43,7 +43,7 @@ def print_table(results: Sequence[EpisodeResult], console: Console | None = None
 def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Console | None = None) -> None:
     """Success rates of several runs side by side, a row a task that any of them has; results by the run's name.
 
-    The last rows compare every other run with the first one in the episodes that both have.
+    The last rows compare each other run with the first one over the episodes that both have.
     """
     rates = {name: {rate.name: rate for rate in success_rates(results)} for name, results in sets.items()}
     table = Table(title="closed-loop success, % (95 % interval)")
@@ -62,8 +62,8 @@ def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Conso
     table.add_row(f"mean of the {tasks} that all have", *(f"{mean:.1f}" for mean in means))
     first, *others = sets.values()
     pairs = [paired(results, first) for results in others]
-    table.add_row("less the first one's, in the same episodes", "", *map(_difference_cell, pairs))
-    table.add_row("p of no difference (McNemar's exact test)", "", *(f"{sign_test(one):.2g}" for one in pairs))
+    table.add_row("difference from the first run, same episodes", "", *map(_difference_cell, pairs))
+    table.add_row("p-value (McNemar's exact test)", "", *(f"{sign_test(one):.2g}" for one in pairs))
     (console or Console()).print(table)
 
 

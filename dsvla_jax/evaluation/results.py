@@ -145,7 +145,7 @@ def macro_mean(rates: Sequence[SuccessRate]) -> float:
 
 
 def paired(first: Sequence[EpisodeResult], second: Sequence[EpisodeResult]) -> Pairs:
-    """How two runs fared in the episodes that both have: those of one task and number start alike."""
+    """Counts outcomes of the episodes that both runs have; episodes of the same task and number start alike."""
     one, other = ({(result.task, result.episode): result.success for result in results} for results in (first, second))
     both = [episode for episode in one if episode in other]
     return count_pairs([one[episode] for episode in both], [other[episode] for episode in both])

@@ -30,7 +30,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
 
 @dataclasses.dataclass(frozen=True)
 class Pairs:
-    """How two policies fared in the same episodes, by number of episodes."""
+    """Counts of the same episodes by which of two policies succeeded."""
 
     both: int
     first: int
@@ -64,8 +64,8 @@ def count_pairs(first: Sequence[bool], second: Sequence[bool]) -> Pairs:
 def paired_interval(pairs: Pairs, confidence: float = 0.95) -> tuple[float, float]:
     """Newcombe's score interval of the difference of two rates in the same episodes.
 
-    Method 10 of Newcombe 1998 (Stat Med 17:2635): Wilson's intervals of both
-    rates, put together with their correlation. Without trials nothing is known: (-1, 1).
+    Method 10 of Newcombe 1998 (Stat Med 17:2635): combines Wilson's intervals of both rates and their correlation.
+    Without trials the interval is (-1, 1).
     """
     a, b, c, d = pairs.both, pairs.first, pairs.second, pairs.neither
     n = pairs.trials

@@ -91,10 +91,7 @@ def start_state(
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
-    """AdamW or Muon.
-
-    Weight decay only on matrices, as norms, biases and embeddings of single rows are no places for it.
-    """
+    """Returns AdamW or Muon, with weight decay on kernels only."""
     warmup = min(config.warmup_steps, max(steps // 5, 1), steps - 1)
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, config.learning_rate, warmup, steps, end_value=config.learning_rate * config.final_fraction
@@ -115,14 +112,14 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
 
 
 def _is_decayed(tree: optax.Params) -> optax.Params:
-    """True for the leaves that weight decay is for."""
+    """Returns True for kernels of more than one dimension."""
     return jax.tree_util.tree_map_with_path(
         lambda path, leaf: leaf.ndim > 1 and "kernel" in jax.tree_util.keystr(path[-1:]), tree
     )
 
 
 def _matrices(tree: optax.Params) -> optax.Params:
-    """How Muon reads the kernels of dense layers, the stacked ones each by itself; None for all other leaves."""
+    """Returns Muon's axes for the kernels of dense layers, stacked ones as separate matrices; None for other leaves."""
 
     def read_as(path: jax.tree_util.KeyPath, leaf: Array) -> MuonDimensionNumbers | None:
         is_dense = path[-1] == jax.tree_util.DictKey("kernel") and leaf.ndim in (2, 3)

@@ -1,20 +1,20 @@
-"""Demonstrations of this project as RLDS builds, which `data_pipelines.rlds.export` writes."""
+"""Demonstrations of this project, exported by `data_pipelines.rlds.export`."""
 
 from data_pipelines.oxe.columns import Openness, Pose, Read
 from data_pipelines.oxe.dataset import ArmColumns, OxeDataset
 
 _SOURCE = "python -m data_pipelines.rlds.export"
-_NOTES = ("steps are keyframes: each one's action is the next, whatever the horizon", "poses are in the world frame")
+_NOTES = ("each step's action is the next keyframe, so the horizon is ignored", "poses are in the world frame")
 
 
 def _arm(first: int) -> ArmColumns:
-    """Of an arm whose eight numbers begin at this column: position, quaternion xyzw, openness."""
-    pose, gripper = slice(first, first + 7), slice(first + 7, first + 8)
+    """Returns the columns of one arm, whose pose starts at column `first` and whose gripper follows it."""
+    gripper = first + 7
     return ArmColumns(
-        gripper=Openness(Read("action", gripper.start, gripper.stop), 0, 1),
-        pose=Pose(Read("observation/state", pose.start, pose.stop), "xyzw"),
-        gripper_state=Openness(Read("observation/state", gripper.start, gripper.stop), 0, 1),
-        keyframe=Pose(Read("action", pose.start, pose.stop), "xyzw"),
+        gripper=Openness(Read("action", gripper, gripper + 1), 0, 1),
+        pose=Pose(Read("observation/state", first, gripper), "xyzw"),
+        gripper_state=Openness(Read("observation/state", gripper, gripper + 1), 0, 1),
+        keyframe=Pose(Read("action", first, gripper), "xyzw"),
     )
 
 
