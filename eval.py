@@ -36,6 +36,7 @@ from dsvla_jax.evaluation.results import (
     require_writable,
     write_results,
 )
+from dsvla_jax.evaluation.seeing import read_errors
 from dsvla_jax.evaluation.withheld import check_parts, withholding
 from dsvla_jax.experiment import Experiment, load_experiment, require_simulated
 from dsvla_jax.files import write_picture
@@ -155,9 +156,25 @@ def main(options: Options) -> None:
     other = dataclasses.replace(conditions, physics="mjx" if options.physics == "mujoco" else "mujoco", loop="host")
     report = folder / "report.html"
     write_report(
-        report, shown, load_strips(strips, shown), latest(results, other.__eq__) or None, title=str(options.run)
+        report,
+        shown,
+        load_strips(strips, shown),
+        latest(results, other.__eq__) or None,
+        withheld=by_withheld(results, conditions),
+        errors=read_errors(folder, digest),
+        title=str(options.run),
     )
     print(f"report: {report}")
+
+
+def by_withheld(results: Sequence[EpisodeResult], conditions: Conditions) -> list[list[EpisodeResult]]:
+    """Results under conditions that differ from these in what is withheld alone, a list for each."""
+    found: dict[tuple[str, ...], list[EpisodeResult]] = {}
+    for one in results:
+        withheld = one.conditions.withheld
+        if withheld != conditions.withheld and dataclasses.replace(conditions, withheld=withheld) == one.conditions:
+            found.setdefault(withheld, []).append(one)
+    return list(found.values())
 
 
 def conditions_of(options: Options, experiment: Experiment, step: int, digest: str) -> Conditions:

@@ -1,18 +1,17 @@
 """What a policy sees: errors on held-out demonstrations and closed-loop success, with parts of its inputs withheld.
 
-Usage: python -m benchmarks.seeing RUN [--tasks press_switch] [--episodes 25] [--out seeing.json]
+Usage: python -m benchmarks.seeing RUN [--tasks press_switch] [--episodes 25]
 
 Errors are medians over held-out demonstrations, a row a task and keyframe: of the position, and of the rotation where
 the demonstrations' rotations differ. Expected: at the first keyframe of every task whose rotation varies at most 10
-degrees, and successes that owe at least 0.5 to the episode's own picture.
+degrees, and successes that owe at least 0.5 to the episode's own picture. The figures are part of RUN/eval/report.html.
 """
 
+import contextlib
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +22,9 @@ from rich.table import Table
 import eval as evaluation
 from data_pipelines.records import Episode, decode_frame
 from data_pipelines.sources import open_held_out
+from dsvla_jax.checkpoints.run import RunCheckpoints
 from dsvla_jax.command_line import configure_jax, fail_with_message
+from dsvla_jax.evaluation.seeing import KeyframeErrors, name_of, write_errors
 from dsvla_jax.evaluation.withheld import Part, withholding
 from dsvla_jax.experiment import load_experiment
 from dsvla_jax.geometry.rotations import rotation_distance
@@ -58,25 +59,6 @@ class Options:
     """Degrees that the first keyframe's median error may have where rotations vary by more than that."""
     picture_share: float = 0.5
     """The least part of success that must be lost with another episode's pictures."""
-    out: Path | None = None
-    """Writes the figures as JSON."""
-
-
-@dataclasses.dataclass(frozen=True)
-class KeyframeErrors:
-    """Medians over demonstrations of one task's keyframe.
-
-    position_cm, rotation_degrees, gripper (the share that is right): of the worse arm. varies_degrees: how far apart
-    the demonstrations' own rotations are, the median over pairs.
-    """
-
-    task: str
-    keyframe: int
-    withheld: tuple[Part, ...]
-    position_cm: float
-    rotation_degrees: float
-    gripper: float
-    varies_degrees: float
 
 
 def held_out_errors(policy: Policy, task: str, episodes: Sequence[Episode]) -> list[KeyframeErrors]:
@@ -104,7 +86,8 @@ def held_out_errors(policy: Policy, task: str, episodes: Sequence[Episode]) -> l
 def closed_loop(options: Options, tasks: Sequence[str]) -> dict[tuple[Part, ...], dict[str, float]]:
     """Success rates by what is withheld and task; those that the run's results already hold are not measured again."""
     rates: dict[tuple[Part, ...], dict[str, float]] = {}
-    for parts in VIEWS:
+    # The plain evaluation is the last, and its report the one that stays.
+    for parts in reversed(VIEWS):
         asked = evaluation.Options(
             options.run, tasks=tuple(tasks), episodes=options.episodes, withhold=parts, skip_finished=True
         )
@@ -113,11 +96,6 @@ def closed_loop(options: Options, tasks: Sequence[str]) -> dict[tuple[Part, ...]
         by_task = {task: [one.success for one in results if one.task == task] for task in tasks}
         rates[parts] = {task: float(np.mean(successes)) for task, successes in by_task.items()}
     return rates
-
-
-def name_of(parts: Sequence[Part]) -> str:
-    """For people."""
-    return "without " + ", ".join(parts).replace("_", " ") if parts else "as it is"
 
 
 def main(options: Options) -> int:
@@ -134,13 +112,12 @@ def main(options: Options) -> int:
     table = Table("task", "keyframe", *map(name_of, VIEWS), title="median error: position cm; rotation degrees")
     for task, keyframe in dict.fromkeys((one.task, one.keyframe) for one in errors):
         row = [one for one in errors if (one.task, one.keyframe) == (task, keyframe)]
-        turns = [f"; {one.rotation_degrees:.0f}" if one.varies_degrees > 1 else "" for one in row]
-        table.add_row(
-            task, str(keyframe), *(f"{one.position_cm:.1f}{turn}" for one, turn in zip(row, turns, strict=True))
-        )
+        table.add_row(task, str(keyframe), *(one.describe() for one in row))
     console = Console()
     console.print(table)
-    figures: dict[str, Any] = {"errors": [dataclasses.asdict(one) for one in errors]}
+    with contextlib.closing(RunCheckpoints(options.run, read_only=True)) as checkpoints:
+        _, digest = checkpoints.identify()
+    write_errors(options.run / "eval", digest, errors)
 
     limit = options.rotation_limit
     first = [one for one in errors if one.keyframe == 1 and not one.withheld and one.varies_degrees > limit]
@@ -155,12 +132,9 @@ def main(options: Options) -> int:
         shown.add_section()
         shown.add_row("mean", *(f"{means[parts]:.3f}" for parts in VIEWS))
         console.print(shown)
-        figures["success"] = [{"withheld": parts, **rates[parts]} for parts in VIEWS]
         owed = means[()] - means[("own_pictures",)]
         print(f"success lost with another episode's pictures: {owed:.3f} (at least {options.picture_share})")
         short += ["pictures"] * (owed < options.picture_share)
-    if options.out is not None:
-        options.out.write_text(json.dumps(figures, indent=1) + "\n")
     return int(bool(short))
 
 

@@ -28,6 +28,7 @@ from dsvla_jax.evaluation.results import (
     success_rates,
     write_results,
 )
+from dsvla_jax.evaluation.seeing import KeyframeErrors, read_errors, write_errors
 from dsvla_jax.evaluation.statistics import Pairs, paired_interval, wilson_interval
 from dsvla_jax.geometry.cameras import front_camera, project
 
@@ -163,8 +164,40 @@ def test_the_report_is_one_page_that_holds_everything(tmp_path):
     assert len(re.findall(r'<div class="episode', text)) == len(RESULTS)
     write_report(path, RESULTS)
     assert "Where physics differ" not in path.read_text()
+    assert "What it sees" not in path.read_text()
     write_report(path, [])
     assert "no episodes" in path.read_text()
+
+
+def test_the_report_shows_what_a_policy_owes_to_what_it_sees(tmp_path):
+    grey = [result("lamp_on", episode, episode == 0, withheld=("colour", "depth")) for episode in range(4)]
+    errors = [
+        KeyframeErrors("lamp_on", 1, (), 1.25, 4.4, 1.0, 60.0),
+        KeyframeErrors("lamp_on", 2, (), 0.5, 90.0, 1.0, 0.0),
+        KeyframeErrors("lamp_on", 1, ("own_pictures",), 20.0, 70.6, 0.5, 60.0),
+    ]
+    write_report(tmp_path / "report.html", RESULTS, withheld=[grey], errors=errors)
+    text = (tmp_path / "report.html").read_text()
+    assert Page(text).open == []
+    rows = [
+        re.findall(r"<t[hd][^>]*>([^<]*)", row) for row in re.findall(r"<tr>.*?</tr>", text.split("What it sees")[1])
+    ]
+    assert ["task", "as it is", "without colour, depth"] in rows
+    assert ["lamp_on", "75", "25"] in rows
+    assert ["task, keyframe", "as it is", "without own pictures"] in rows
+    assert ["lamp_on, 1", "1.2; 4", "20.0; 71"] in rows
+    assert ["lamp_on, 2", "0.5", ""] in rows, "a rotation that is always the same is not an error of seeing"
+
+
+def test_errors_are_those_of_their_checkpoint(tmp_path):
+    errors = [KeyframeErrors("lamp_on", 1, ("colour", "depth"), 1.25, 4.4, 1.0, 60.0)]
+    assert read_errors(tmp_path, "abc") == []
+    write_errors(tmp_path, "abc", errors)
+    assert read_errors(tmp_path, "abc") == errors
+    assert read_errors(tmp_path, "later") == []
+    (tmp_path / "seeing.json").write_text('{"digest": "abc", "errors": [{"task": 1}]}')
+    with pytest.raises(UserError, match=r"seeing\.json: not what benchmarks\.seeing wrote"):
+        read_errors(tmp_path, "abc")
 
 
 def test_runs_are_compared_on_the_tasks_that_all_have():

@@ -1,5 +1,6 @@
 """Success rates for people: tables for the terminal, and one self-contained HTML page."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from dsvla_jax.evaluation.results import (
     pooled,
     success_rates,
 )
+from dsvla_jax.evaluation.seeing import KeyframeErrors, name_of
 from dsvla_jax.evaluation.statistics import Pairs, paired_interval, sign_test
 
 
@@ -94,12 +96,16 @@ def write_report(
     results: Sequence[EpisodeResult],
     strips: Mapping[tuple[str, int], Sequence[np.ndarray]] | None = None,
     other: Sequence[EpisodeResult] | None = None,
+    withheld: Sequence[Sequence[EpisodeResult]] = (),
+    errors: Sequence[KeyframeErrors] = (),
     title: str = "Closed-loop evaluation",
 ) -> None:
     """The HTML report: rates with intervals, a row an episode with its film strip, and where physics differ.
 
     strips: RGB frames uint8 (H, W, 3) by task and episode; see `mark_targets`. other: results under the other kind of
-    physics, compared where they are of the same episodes and checkpoint. The page needs no other file and no network.
+    physics, compared where they are of the same episodes and checkpoint. withheld: results of the same checkpoint
+    with other parts of its observations withheld, and errors: its errors on held-out demonstrations. The page needs no
+    other file and no network.
     """
     rates = success_rates(results)
     write_html(
@@ -114,7 +120,42 @@ def write_report(
         pictures={key: png_data(film_strip(frames)) for key, frames in (strips or {}).items() if len(frames)},
         comparison=compare_physics(results, other) if other else None,
         checkpoints=checkpoints_of(results),
+        seen=Seen.of([results, *withheld], errors),
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What a policy owes to what it sees, as tables: what is withheld heads the columns.
+
+    success: a row a task, and the mean. errors: a row a task and keyframe.
+    """
+
+    success_columns: list[str]
+    success: list[tuple[str, list[str]]]
+    error_columns: list[str]
+    errors: list[tuple[str, list[str]]]
+
+    @classmethod
+    def of(cls, results: Sequence[Sequence[EpisodeResult]], errors: Sequence[KeyframeErrors]) -> "Seen":
+        """results: of one kind of conditions each."""
+        results = sorted((some for some in results if some), key=lambda some: some[0].conditions.withheld)
+        rates = [success_rates(some) for some in results]
+        by_task = [{rate.name: f"{100 * rate.rate:.0f}" for rate in some} for some in rates]
+        tasks = dict.fromkeys(task for some in by_task for task in some)
+        rows = [(task, [some.get(task, "") for some in by_task]) for task in tasks]
+        rows.append(("mean of tasks", [f"{100 * macro_mean(some):.1f}" for some in rates]))
+        views = list(dict.fromkeys(one.withheld for one in errors))
+        cells = {(one.task, one.keyframe, one.withheld): one.describe() for one in errors}
+        return cls(
+            success_columns=[name_of(some[0].conditions.withheld) for some in results],
+            success=rows if len(results) > 1 else [],
+            error_columns=[name_of(parts) for parts in views],
+            errors=[
+                (f"{task}, {keyframe}", [cells.get((task, keyframe, view), "") for view in views])
+                for task, keyframe in dict.fromkeys((one.task, one.keyframe) for one in errors)
+            ],
+        )
 
 
 def describe(results: Sequence[EpisodeResult]) -> str:
