@@ -169,12 +169,9 @@ def main(options: Options) -> None:
 
 def by_withheld(results: Sequence[EpisodeResult], conditions: Conditions) -> list[list[EpisodeResult]]:
     """Results under conditions that differ from these in what is withheld alone, a list for each."""
-    found: dict[tuple[str, ...], list[EpisodeResult]] = {}
-    for one in results:
-        withheld = one.conditions.withheld
-        if withheld != conditions.withheld and dataclasses.replace(conditions, withheld=withheld) == one.conditions:
-            found.setdefault(withheld, []).append(one)
-    return list(found.values())
+    others = dict.fromkeys(one.conditions.withheld for one in results if one.conditions.withheld != conditions.withheld)
+    found = [latest(results, dataclasses.replace(conditions, withheld=parts).__eq__) for parts in others]
+    return [some for some in found if some]
 
 
 def conditions_of(options: Options, experiment: Experiment, step: int, digest: str) -> Conditions:

@@ -102,7 +102,9 @@ def main(options: Options) -> int:
     """Prints the figures; 0 if none falls short."""
     experiment = load_experiment(options.run / "config.json")
     tasks = select_tasks(options.tasks or experiment.data.tasks)
-    policy = load_policy(options.run)
+    with contextlib.closing(RunCheckpoints(options.run, read_only=True)) as checkpoints:
+        step, digest = checkpoints.identify()
+    policy = load_policy(options.run, step=step)
     data = dataclasses.replace(experiment.data, tasks=tasks)
     reader = open_held_out(data, policy.tokenizer, options.held_out)
     episodes = [reader.episode(number) for number in range(len(reader))]
@@ -115,8 +117,6 @@ def main(options: Options) -> int:
         table.add_row(task, str(keyframe), *(one.describe() for one in row))
     console = Console()
     console.print(table)
-    with contextlib.closing(RunCheckpoints(options.run, read_only=True)) as checkpoints:
-        _, digest = checkpoints.identify()
     write_errors(options.run / "eval", digest, errors)
 
     limit = options.rotation_limit

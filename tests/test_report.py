@@ -184,6 +184,8 @@ def test_the_report_shows_what_a_policy_owes_to_what_it_sees(tmp_path):
     ]
     assert ["task", "as it is", "without colour, depth"] in rows
     assert ["lamp_on", "75", "25"] in rows
+    assert ["lift_ball", "0", ""] in rows
+    assert ["mean of the task that all have", "75.0", "25.0"] in rows, "not of lift_ball, which one of them lacks"
     assert ["task, keyframe", "as it is", "without own pictures"] in rows
     assert ["lamp_on, 1", "1.2; 4", "20.0; 71"] in rows
     assert ["lamp_on, 2", "0.5", ""] in rows, "a rotation that is always the same is not an error of seeing"

@@ -58,15 +58,20 @@ def print_comparison(sets: Mapping[str, Sequence[EpisodeResult]], console: Conso
         cells = [_rate_cell(of_run.get(task)) for of_run in rates.values()]
         table.add_row(task, *cells)
     table.add_section()
-    common = set.intersection(*(set(of_run) for of_run in rates.values()))
-    means = [100 * macro_mean([rate for task, rate in of_run.items() if task in common]) for of_run in rates.values()]
-    tasks = "task" if len(common) == 1 else f"{len(common)} tasks"
-    table.add_row(f"mean of the {tasks} that all have", *(f"{mean:.1f}" for mean in means))
+    table.add_row(*_means([list(of_run.values()) for of_run in rates.values()]))
     first, *others = sets.values()
     pairs = [paired(results, first) for results in others]
     table.add_row("difference from the first run, same episodes", "", *map(_difference_cell, pairs))
     table.add_row("p-value (McNemar's exact test)", "", *(f"{sign_test(one):.2g}" for one in pairs))
     (console or Console()).print(table)
+
+
+def _means(sets: Sequence[Sequence[SuccessRate]]) -> list[str]:
+    """The mean of the tasks that all sets have: its name, then a cell a set."""
+    common = set.intersection(*({rate.name for rate in rates} for rates in sets))
+    tasks = "task" if len(common) == 1 else f"{len(common)} tasks"
+    means = [100 * macro_mean([rate for rate in rates if rate.name in common]) for rates in sets]
+    return [f"mean of the {tasks} that all have", *(f"{mean:.1f}" for mean in means)]
 
 
 def _rate_cell(rate: SuccessRate | None) -> str:
@@ -140,16 +145,19 @@ class Seen:
     def of(cls, results: Sequence[Sequence[EpisodeResult]], errors: Sequence[KeyframeErrors]) -> "Seen":
         """results: of one kind of conditions each."""
         results = sorted((some for some in results if some), key=lambda some: some[0].conditions.withheld)
-        rates = [success_rates(some) for some in results]
-        by_task = [{rate.name: f"{100 * rate.rate:.0f}" for rate in some} for some in rates]
-        tasks = dict.fromkeys(task for some in by_task for task in some)
-        rows = [(task, [some.get(task, "") for some in by_task]) for task in tasks]
-        rows.append(("mean of tasks", [f"{100 * macro_mean(some):.1f}" for some in rates]))
+        success: list[tuple[str, list[str]]] = []
+        if len(results) > 1:
+            rates = [success_rates(some) for some in results]
+            by_task = [{rate.name: f"{100 * rate.rate:.0f}" for rate in some} for some in rates]
+            tasks = dict.fromkeys(task for some in by_task for task in some)
+            success = [(task, [some.get(task, "") for some in by_task]) for task in tasks]
+            name, *means = _means(rates)
+            success.append((name, means))
         views = list(dict.fromkeys(one.withheld for one in errors))
         cells = {(one.task, one.keyframe, one.withheld): one.describe() for one in errors}
         return cls(
             success_columns=[name_of(some[0].conditions.withheld) for some in results],
-            success=rows if len(results) > 1 else [],
+            success=success,
             error_columns=[name_of(parts) for parts in views],
             errors=[
                 (f"{task}, {keyframe}", [cells.get((task, keyframe, view), "") for view in views])
